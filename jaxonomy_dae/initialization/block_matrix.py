@@ -57,7 +57,8 @@ class Block:
             columns.append(place[instance, slot])
             entries.append(of_slots(group)[instance, slot])
         places = np.concatenate(rows), np.concatenate(columns)
-        return sp.csr_array((np.concatenate(entries), places), shape=(len(self.unknown),) * 2)
+        shape = (sum(map(len, self.equations)), len(self.unknown))
+        return sp.csr_array((np.concatenate(entries), places), shape=shape)
 
     def jacobian(self, known: Known) -> Any:
         """∂(residuals)/∂(unknowns)."""
@@ -68,7 +69,7 @@ class Block:
         matrix, errors = self.jacobian(known), self.matrix(lambda g: g.partial_errors(known.at, known.errors))
         if not np.isfinite(matrix.data).all():
             return None
-        if len(self.unknown) > DENSE_LIMIT:
+        if matrix.shape[0] > DENSE_LIMIT:
             return sparse_rank_of(matrix, errors)
         return rank_of(matrix.toarray(), errors.toarray())
 

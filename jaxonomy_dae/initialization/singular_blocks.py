@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from ..judgement.rank import Rank, are_evident, is_undecided, rank_of
+from ..judgement.rank import Rank, are_evident, is_undecided
 from ..judgement.sparse_rank import SparseRank
 from ..lowering.plan import SystemPlan
 from ..lowering.remembered import remembered
@@ -218,38 +218,29 @@ def _causes(plan: SystemPlan, known: Known, block: Block, rank: Rank | SparseRan
 
 def _constraints(plan: SystemPlan, known: Known) -> Iterator[BlockFinding]:
     """Hidden constraints that depend on each other at the state: the projection could not tell them apart."""
-    m, values = plan.n_constraints, known.at.values
+    m, values, groups = plan.n_constraints, known.at.values, tuple(planned.equation for planned in plan.constraints)
     if not m or plan.constraint_pattern is None or m > DENSE_LIMIT:
         return
-    place = np.full(len(values), -1)  # ZERO is −1: the last entry
-    place[plan.states] = np.arange(len(plan.states))
-    matrix, errors = np.zeros((2, m, len(plan.states)))
-    texts = []
-    row = 0
-    for planned in plan.constraints:
-        group = planned.equation
-        if np.isnan(values[group.quantity]).any() or group.template.opaque is not None:
-            return
-        instance, slot = np.nonzero(place[group.quantity] >= 0)
-        entries = row + instance, place[group.quantity[instance, slot]]
-        np.add.at(matrix, entries, group.partials(known.at)[instance, slot])
-        np.add.at(errors, entries, group.partial_errors(known.at, known.errors)[instance, slot])
-        texts += group.equation.tolist()
-        row += len(group)
-    if not np.isfinite(matrix).all():
+    if any(np.isnan(values[group.quantity]).any() or group.template.opaque is not None for group in groups):
         return
-    rank = rank_of(matrix, errors)
-    condition = rank.condition if rank.is_regular else np.inf
-    if condition < ILL_CONDITIONED:
+    block = Block(groups, plan.states)
+    rank, matrix = block.rank(known), block.jacobian(known).toarray()
+    if rank is None or (rank.is_regular and rank.condition < ILL_CONDITIONED):
         return
+    texts = np.concatenate([group.equation for group in groups])
     dependent = np.flatnonzero(np.abs(rank.null_vectors()[0]).max(axis=1, initial=0.0) > SLIGHT)
     states = np.flatnonzero(np.abs(matrix[dependent]).max(axis=0, initial=0.0) > 0)
     if not len(states):
         states = np.array(sorted({k for r in dependent for k in plan.constraint_pattern[r]}), np.int64)
-    names = tuple(plan.quantity_name[int(plan.states[k])] for k in states)
-    singular = not rank.is_regular
-    at = tuple((name, float(values[plan.states[k]])) for name, k in zip(names, states, strict=True))
+    at = [(plan.quantity_name[q], float(values[q])) for q in plan.states[states].tolist()]
+    names, singular = tuple(name for name, _ in at), not rank.is_regular
     yield BlockFinding(
-        float(condition), singular, m, names, tuple(plan.locate(texts[e]) for e in dependent), at, False,
-        undecided=singular and is_undecided(matrix),
-    )  # fmt: skip
+        rank.condition if rank.is_regular else np.inf,
+        singular,
+        m,
+        names,
+        tuple(plan.locate(int(texts[e])) for e in dependent),
+        tuple(at),
+        False,
+        singular and is_undecided(matrix),
+    )

@@ -10,10 +10,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from problems import component
 from verdicts import MODELS, verdict
 
 import jaxonomy_dae
+from jaxonomy_dae import AcausalDiagram, der
+from jaxonomy_dae.compiler.flatten import flatten
+from jaxonomy_dae.compiler.pipeline import compile_flat
+from jaxonomy_dae.initialization.singular_blocks import examine_blocks
+from jaxonomy_dae.lowering.lower import lower
 
 CASES = [(name, mode) for name, model in MODELS.items() for mode in model.modes]
 
@@ -47,3 +54,20 @@ def test_the_processor_does_not_decide(kernel):
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert set(found.values()) == {"refused"} and len(found) > 10
+
+
+@pytest.mark.parametrize("k", [1.0, 1e6])
+def test_causes_do_not_depend_on_units(k):
+    """The null vectors of the scaled matrix were taken for those of the block itself: with unknowns of different sizes,
+    a parameter that only multiplies an equation was said to make the block singular, and the variable that does was
+    not."""
+
+    def write(self, ev):
+        z, x, y = self.variable("z", start=3.0, fixed=True), self.variable("x"), self.variable("y")
+        self.add_equations(der(z) + z, self.parameter("p", 2.0) * (x + k * y) - 1, x + (k + z - 3) * y - 2)
+
+    flat = flatten(AcausalDiagram().add(component(write)))
+    plan = lower(compile_flat(flat, "auto", ()))
+    (finding,) = examine_blocks(plan, flat.declares.values, (), 0.0, np.array([3.0]), lambda: np.zeros(0))
+    assert finding.singular and set(finding.variables) == {"c.x", "c.y"}
+    assert finding.causes == (("c.z", 3.0),)
