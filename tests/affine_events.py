@@ -15,10 +15,9 @@ import numpy as np
 
 from jaxonomy_dae.hybrid.control import EventControl
 from jaxonomy_dae.hybrid.facts import EventFacts
-from jaxonomy_dae.hybrid.problem import AbstractHybridProblem
+from jaxonomy_dae.hybrid.problem import AbstractHybridProblem, HybridTerm
 from jaxonomy_dae.hybrid.solver import WithEvents
 from jaxonomy_dae.hybrid.start import start
-from jaxonomy_dae.hybrid.term import HybridTerm
 from jaxonomy_dae.modeling.event_flags import NO_FLAG, EventFlag
 from jaxonomy_dae.solvers.drive import integrate
 

@@ -5,9 +5,8 @@ import numpy as np
 from ..errors import StructuralError
 from ..model.group import Group, Point
 from ..model.tables import ZERO, EquationGroup, ParameterTable, equation_offsets, locate
-from ..structure.diagonal_blocks import diagonal_blocks
 from ..structure.incidence import Incidence
-from ..structure.pantelides import Offsets
+from ..structure.pantelides import Offsets, diagonal_blocks
 from .number_columns import Columns
 
 

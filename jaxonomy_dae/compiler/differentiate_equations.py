@@ -48,14 +48,14 @@ def differentiate_equations(groups: tuple[EquationGroup, ...], offsets: Offsets,
             quantity = np.where(zero, ZERO, first[column[v]] + o)
             out.append(
                 ExtendedGroup(
-                    template,
-                    first_extended[first_equation + rows] + k,
-                    quantity,
-                    np.where(zero, 0, s),
-                    group.parameter[rows],
-                    group.coefficient[rows],
-                    first_equation + rows,
-                    k,
+                    template=template,
+                    equation=first_extended[first_equation + rows] + k,
+                    quantity=quantity,
+                    factor=np.where(zero, 0, s),
+                    parameter=group.parameter[rows],
+                    coefficient=group.coefficient[rows],
+                    base=first_equation + rows,
+                    level=k,
                 )
             )
             k += 1

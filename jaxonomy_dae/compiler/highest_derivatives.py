@@ -150,7 +150,16 @@ class HighestDerivatives:
             own = count + np.arange(len(group))
             count += len(group)
             groups.append(
-                ExtendedGroup(group.template, own, quantity, group.factor, group.parameter, group.coefficient, own, 0)
+                ExtendedGroup(
+                    template=group.template,
+                    equation=own,
+                    quantity=quantity,
+                    factor=group.factor,
+                    parameter=group.parameter,
+                    coefficient=group.coefficient,
+                    base=own,
+                    level=0,
+                )
             )
         size, _ = natural_sizes(groups, count, np.zeros(len(number)), self.values, by_terms=True)
         return groups, np.array(list(number), np.int64).reshape(-1, 2), np.abs(size)

@@ -22,10 +22,9 @@ from ..model.incidence import incidence
 from ..model.provenance import Provenance, combination
 from ..model.tables import ZERO, EquationGroup, ParameterTable, equation_offsets, provenance_of
 from ..modeling.symbols import TIME_LABEL
-from ..structure.diagonal_blocks import diagonal_blocks
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
-from ..structure.pantelides import Offsets, reduce_index
+from ..structure.pantelides import Offsets, diagonal_blocks, reduce_index
 from ..tolerances import KNOWN
 from . import elimination
 from .combine_equations import combine, graph_of, group_of, has_branches, near, quantity_label, slope_left, tried

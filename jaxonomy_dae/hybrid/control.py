@@ -7,8 +7,7 @@ from jax import Array, lax
 
 from ..adjoint.wrapped_control import WrappedControl
 from ..aliases import Result
-from .problem import HybridState
-from .term import bound
+from .problem import HybridState, bound
 
 ENDED: Result = diffrax.RESULTS.event_occurred  # Diffrax asks the controller last, so that it must say so
 # By how much the step after one that an event made short may be longer than it, up to the length that was planned

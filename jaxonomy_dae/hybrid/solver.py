@@ -16,8 +16,7 @@ from .event_map import handle, most_at_once
 from .kinks import turned
 from .log import EventRows
 from .looking import looked_at
-from .problem import HybridState
-from .term import bound, problem_of
+from .problem import HybridState, bound, problem_of
 
 MOVED = 1e3  # times the resolution: with a longer step time has gone on, and turns at one instant are counted anew
 

@@ -104,7 +104,16 @@ class _Cell(TwoPin):
             overpotentials += v
             heat += v**2 / r
         table, integral = interpolated(z, points, volts, kind)
-        return _Circuit(voltage, current, z, reacting, table, charge * integral, overpotentials, heat)
+        return _Circuit(
+            voltage=voltage,
+            current=current,
+            soc=z,
+            reacting=reacting,
+            table=table,
+            table_energy=charge * integral,
+            overpotentials=overpotentials,
+            heat=heat,
+        )
 
 
 class Cell(_Cell):

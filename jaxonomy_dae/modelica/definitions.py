@@ -89,8 +89,8 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
     read_before = set(with_entries(before, model))
     followed = [name for name in of if name in read_before and name not in by_when]
     return DiscreteDefinitions(
-        of, by_when | set(followed), followed, equations, whens,
-        list(model.initial_equations), algorithms, assigned,
+        of=of, stored=by_when | set(followed), followed=followed, equations=equations, whens=whens,
+        initial=list(model.initial_equations), algorithms=algorithms, assigned=assigned,
     )  # fmt: skip
 
 

@@ -238,7 +238,16 @@ class Component(ModeDeclarations, metaclass=Construction):
         interval = Interval() if bounds is None else as_interval(bounds, where)
         if isinstance(start, sympy.Number) and float(start) not in interval:
             raise ModelError(f"the start value of {where} must lie in its bounds {interval}; got {start}")
-        self.variables[name] = Variable(name, kind, start, bool(fixed), float(nominal or 0.0), unit, default, interval)
+        self.variables[name] = Variable(
+            name=name,
+            kind=kind,
+            start=start,
+            fixed=bool(fixed),
+            nominal=float(nominal or 0.0),
+            unit=unit,
+            default=default,
+            bounds=interval,
+        )
         return VariableSymbol(name)
 
     def variable(

@@ -17,8 +17,8 @@ from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..model.networks import Networks
 from ..model.tables import ZERO, AccountGroup
-from ..programs.blocks import at_times
 from ..programs.cache import compiled
+from ..programs.rows import at_times
 from ..programs.staging import is_staged
 from ..system.system import AcausalSystem
 

@@ -11,10 +11,9 @@ from jax import Array
 
 from ..aliases import Args, Controller, Inputs, PyTree, Result, Solver, State, Time, Times
 from ..hybrid.control import ENDED
-from ..hybrid.problem import HybridState
+from ..hybrid.problem import HybridState, HybridTerm
 from ..hybrid.solver import CLASH, WithEvents
 from ..hybrid.start import start
-from ..hybrid.term import HybridTerm
 from ..initialization.check import check
 from ..initialization.initialize import InitialPoint, initialize, is_consistent
 from ..initialization.ladder import Found

@@ -17,10 +17,9 @@ from ..aliases import Numeric, Result, Solver, Time, Times, Tolerance
 from ..errors import ModelError
 from ..lowering.gather import times
 from ..optional import Axes
-from ..programs.blocks import at_times, fit
 from ..programs.cache import compiled
 from ..programs.platform import precisely
-from ..programs.rows import filled_up, size_for
+from ..programs.rows import at_times, filled_up, fit, size_for
 from ..programs.staging import is_staged, is_traced, on_device, picked
 from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms

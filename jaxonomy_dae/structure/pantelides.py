@@ -1,4 +1,4 @@
-"""Index reduction: which equations must be differentiated, and how often.
+"""Index reduction: which equations must be differentiated, how often, and which blocks their highest derivatives form.
 
 Given the signature matrix σ (σᵢⱼ: highest order of variable j in equation i), finds the smallest numbers cᵢ ≥ 0 of
 differentiations and dⱼ such that dⱼ ≥ σᵢⱼ + cᵢ and the equations i, differentiated cᵢ times, can be matched with the
@@ -11,6 +11,8 @@ No differentiated equation is ever built here: the pass works on integers alone.
 import dataclasses
 
 import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 from ..errors import StructuralError
 from .incidence import Incidence
@@ -137,3 +139,16 @@ def _augment(root, pointer, columns, sigma, c, d, of_variable, of_equation):
             position[e] = end
             stack.pop()
     return seen_equations, list(came_from)
+
+
+def diagonal_blocks(signature: Incidence, offsets: Offsets) -> tuple[np.ndarray, np.ndarray]:
+    """The diagonal block of every equation in the system Jacobian, and how many equations that block has."""
+    rows, n = signature.rows, signature.n_equations
+    active = signature.order + offsets.equation[rows] == offsets.variable[signature.variable]
+    owner = np.empty(signature.n_variables, np.int64)
+    owner[offsets.matched_variable] = np.arange(n)
+    follow = (rows[active], owner[signature.variable[active]])
+    _, label = connected_components(
+        sp.coo_array((np.ones(len(follow[0])), follow), shape=(n, n)), directed=True, connection="strong"
+    )
+    return label, np.bincount(label)[label]
