@@ -107,7 +107,7 @@ def is_undecided(matrix: Float[np.ndarray, "m n"]) -> bool:
 def are_evident(matrices: Float[np.ndarray, "b n n"], errors: Float[np.ndarray, "b n n"]) -> np.ndarray:
     """True for matrices that are finite, regular and well-conditioned at a glance, as most are, shape (b,): with rows
     and then columns scaled to a largest entry of 1."""
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     size, errors = np.where(finite[:, None, None], np.abs(matrices), 0.0), np.where(finite[:, None, None], errors, 0.0)
     if matrices.shape[1] == 1:  # a single coefficient has no scale but zero
         return finite & (size > errors)[:, 0, 0]

@@ -105,7 +105,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
 
 def _schedule(
     model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None
-) -> tuple[Sequence[AnyStep], np.ndarray]:
+) -> tuple[tuple[AnyStep, ...], np.ndarray]:
     """Returns (the steps in order, the unknowns whose values are carried along as guesses)."""
     steps = build_schedule(model.reduced.extended, model.blocks, EntrySizes(model.reduced))
     for step in steps:

@@ -23,7 +23,7 @@ class LearnedLaw:
     """
 
     name: str
-    network: eqx.Module
+    network: Callable
     inputs: Sequence[str]
     beside: bool
 
