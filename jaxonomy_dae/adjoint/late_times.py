@@ -108,14 +108,10 @@ class _FirstStep(WrappedControl):
     dt0: Time
 
     def wrap(self, direction):
-        wrapped = self.controller.wrap(direction)
-        return _FirstStep(wrapped, self.dt0 * direction)  # pyright: ignore[reportCallIssue]
+        return dataclasses.replace(super().wrap(direction), dt0=self.dt0 * direction)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         return self.controller.init(terms, t0, t1, y0, self.dt0, args, func, error_order)
-
-    def adapt_step_size(self, *given):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.adapt_step_size(*given)
 
 
 class _StepTo(diffrax.AbstractStepSizeController):

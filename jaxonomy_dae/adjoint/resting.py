@@ -266,14 +266,11 @@ def held_back(
 
 
 class HeldBack(WrappedControl):
-    """Wraps a controller so that it resolves derivatives of components at rest, for adjoints other than
+    """Wraps a controller so that it resolves derivatives of components at rest, for all adjoints but the record of
     `StoredAdjoint`, which does so by itself."""
 
     terms: Terms
     solver: Solver
-
-    def wrap(self, direction):
-        return HeldBack(self.controller.wrap(direction), self.terms, self.solver)  # pyright: ignore[reportCallIssue]
 
     def _resting(self, y, args, span) -> Resting:
         found = Resting.of(self.terms, self.solver, self.controller, y, args, span)
@@ -283,8 +280,12 @@ class HeldBack(WrappedControl):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """As `controller.init`, with the first step no longer than the second run allows."""
         end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        resting = self._resting(y0, args, t1 - t0)
-        return _no_later(t0, end, resting.first_end(t0, end, y0)), (state, t1 - t0, resting.begin(t0, y0))
+        return self.begun(t0, end, state, y0, args, t1 - t0)
+
+    def begun(self, t: Time, end: Time, state: Any, y: State, args: Args, span: Time) -> tuple[Any, Any]:
+        """(The end of the first step, the state of the controller), given those of the wrapped one."""
+        resting = self._resting(y, args, span)
+        return _no_later(t, end, resting.first_end(t, end, y)), (state, span, resting.begin(t, y))
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
         """As `controller.adapt_step_size`, with the next step no longer than the second run allows."""

@@ -19,7 +19,7 @@ from ..programs.members import batch_size
 from .appended import NOTED, apart, together
 from .closure_conversion import SolveProgram, as_traced, by_itself_or_batched, closure_convert, unless_waiting
 from .recorded_loop import solve
-from .resting import AttemptedStep, Resting
+from .resting import AttemptedStep, HeldBack, Resting
 from .reverse_step import state_saves
 
 LARGEST_RECORD = 2**25  # bytes; a solve whose record would be larger is left to `RecursiveCheckpointAdjoint`
@@ -65,14 +65,16 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
 
     - `members`: of the batch in which the solve is one, where `jax.vmap` cannot be seen from inside: in
         `jax.vmap(jax.jit(f))`.
+    - `known`: that all values are known, so that nothing will be differentiated.
     """
 
     members: int = eqx.field(static=True, default=1)
+    known: bool = eqx.field(static=True, default=False)
 
     def loop(self, **given: PyTree) -> PyTree:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The loop over the steps, called by `diffrax.diffeqsolve`."""
         if not has_stored_adjoint():
-            return diffrax.RecursiveCheckpointAdjoint().loop(**given)
+            return self._by_checkpoints(**given)
         terms, solver, saveat, max_steps = (given[name] for name in ("terms", "solver", "saveat", "max_steps"))
         init_state, progress_meter = given["init_state"], given["progress_meter"]
         y, empty = apart(init_state.y)
@@ -85,7 +87,9 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         chunk, points = _table(max_steps, size, members)
         too_large = size * (chunk + points) > LARGEST_RECORD
         if given["event"] is not None or saveat.dense or _is_random(terms) or too_large:
-            return diffrax.RecursiveCheckpointAdjoint().loop(**given)
+            return self._by_checkpoints(
+                **given | dict(init_state=dataclasses.replace(init_state, y=together(y, empty)))
+            )
         # Diffrax' inner loop does not take these.
         for name in ("throw", "passed_solver_state", "passed_controller_state"):
             del given[name]
@@ -157,6 +161,18 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             progress_meter_state=final_state.progress_meter_state[0],
         )
         return final_state, stats
+
+    def _by_checkpoints(self, **given: Any) -> Any:
+        """The loop as `diffrax.RecursiveCheckpointAdjoint` differentiates it, steps held back where components rest."""
+        terms, solver, controller, args = (given[name] for name in ("terms", "solver", "stepsize_controller", "args"))
+        state = given["init_state"]
+        span = given["t1"] - state.tprev
+        if not (self.known or _is_random(terms)) and Resting.of(terms, solver, controller, state.y, args, span):
+            held = HeldBack(controller, terms, solver)  # pyright: ignore[reportCallIssue]
+            end, controlled = held.begun(state.tprev, state.tnext, state.controller_state, state.y, args, span)
+            state = dataclasses.replace(state, tnext=end, controller_state=_arrays(controlled))
+            given = given | dict(stepsize_controller=held, init_state=state)
+        return diffrax.RecursiveCheckpointAdjoint().loop(**given)
 
 
 def _is_random(terms: Terms) -> bool:
@@ -359,9 +375,9 @@ def forward_mode() -> Iterator[None]:
         _forward.reset(token)
 
 
-def default_adjoint(forwards: bool, members: int = 1) -> diffrax.AbstractAdjoint:
+def default_adjoint(forwards: bool, members: int = 1, known: bool = False) -> diffrax.AbstractAdjoint:
     """The adjoint where the user gives none. `forwards` is true if forward mode alone differentiates the arguments;
-    `members` is the size of the batch that they are."""
+    `members` is the size of the batch that they are; `known`, that all of them have values."""
     if forwards or _forward.get():
         return diffrax.ForwardMode()
-    return StoredAdjoint(members) if has_stored_adjoint() else diffrax.RecursiveCheckpointAdjoint()
+    return StoredAdjoint(members, known) if has_stored_adjoint() else diffrax.RecursiveCheckpointAdjoint()

@@ -20,9 +20,6 @@ class EventControl(WrappedControl):
     """Wraps a controller so that steps end at events: a step in which an event was found is retried up to it, and no
     step goes beyond the next tick of a clock."""
 
-    def wrap(self, direction):
-        return EventControl(self.controller.wrap(direction))  # pyright: ignore[reportCallIssue]
-
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """Returns (the end of the first step, (the wrapped controller's state, the length that a step shortened by an
         event would have had: infinity, for none has been yet))."""

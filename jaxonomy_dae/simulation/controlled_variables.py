@@ -29,18 +29,10 @@ class ControlledVariables(WrappedControl):
     - `quantity`, `factor`: the variables, shape (m,) each; `extra`: their absolute tolerances, shape (m,).
     """
 
-    controller: Controller
     system: AcausalSystem
     extra: Tolerance
     quantity: tuple[int, ...] = eqx.field(static=True)
     factor: tuple[float, ...] = eqx.field(static=True)
-
-    def wrap(self, direction):
-        return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The end of the first step, and the state of the controller."""
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         """As `controller.adapt_step_size`, of the state and the variables."""

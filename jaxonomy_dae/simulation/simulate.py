@@ -196,18 +196,20 @@ def simulate(
     if isinstance(initial, Mapping):  # one search for all runs of this call, whichever solvers they take
         begun = known_start(system, *as_given) if staged else search_outside(system, t0, inputs, initial)
     most_events = MOST_EVENTS if max_events is None else max_events
-    sides_possible = not is_traced((given, adjoint, stepsize_controller))
+    known = not is_traced((given, adjoint, stepsize_controller))
 
     def options(solver: Solver, room: int = ROOM) -> Options:
         events = system.plan.events
         listed = room if max_events is None else max_events
         room = listed if events is not None and events.are_listed else 0
         few = room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS
-        sides = few and sides_possible if save_events is None else save_events
+        sides = few and known if save_events is None else save_events
         steps = stepsize_controller
         if steps is None:
             steps = controller_for(system, solver, rtol, atol, dtmax, control)
-        chosen = default_adjoint(is_forwards(given), batch_size(given)) if adjoint is None else adjoint
+        chosen = adjoint
+        if chosen is None:
+            chosen = default_adjoint(is_forwards(given), batch_size(given), known)
         return Options(
             solver=solver,
             adjoint=chosen,

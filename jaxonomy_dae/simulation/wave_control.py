@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..adjoint.wrapped_control import WrappedControl
-from ..aliases import Controller, Time
+from ..aliases import Time
 
 QUARTER = 0.5 * jnp.pi  # of a turn, radians
 # Of a quarter: shorter steps look at a wave 16 times in a period, and are left alone, because an implicit solver pays
@@ -24,26 +24,13 @@ class WaveControl(WrappedControl):
     """Wraps a controller for inputs that are waves sin(ωt + φ): steps are at most a quarter of the shortest period, and
     long steps end where a wave is zero, one or minus one. Times are constants of differentiation, as step sizes are."""
 
-    controller: Controller
     frequency: Float[Array, " waves"]
     phase: Float[Array, " waves"]
 
-    def wrap(self, direction):
-        return WaveControl(self.controller.wrap(direction), self.frequency, self.phase)  # pyright: ignore[reportCallIssue]
+    def first_end(self, start: Time, end: Time) -> Time:
+        return self.next_end(start, end)
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The end of the first step, and the state of the controller."""
-        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return self._end(t0, end), state
-
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Lets the wrapped controller accept or reject the step, and shortens the next one by `_end`."""
-        keep, start, end, jump, state, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-        )
-        return keep, start, self._end(start, end), jump, state, result
-
-    def _end(self, start: Time, end: Time) -> Time:
+    def next_end(self, start: Time, end: Time) -> Time:
         """The end of a step that the wrapped controller would take from `start` to `end`, moved forwards so that steps
         end where a wave has turned by whole quarters."""
         begin, step, frequency, phase = lax.stop_gradient((start, end - start, self.frequency, self.phase))
