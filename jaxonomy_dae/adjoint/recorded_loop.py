@@ -9,6 +9,7 @@ from jax import lax
 
 from ..aliases import PyTree
 from ..private_names import private
+from ..programs.whole_records import RECORDS_ARE_WHOLE, flag
 from .appended import appended
 from .closure_conversion import SolveProgram, any_member, apart, going, read, rows, unless_waiting, written
 from .packing import Packing
@@ -145,7 +146,7 @@ def _(perturbed, numbers, program):
     loop = lax.while_loop(lambda loop: recorder.going(loop[0]), advance, loop)
     carry, buffers, table, chunks, stride, kept, record, filled = loop
     state, _, moves, _ = recorder.unpack(carry)
-    return (state, buffers, table), (state, moves, chunks, stride, kept, record, filled)
+    return (state, buffers, table), (state, moves, chunks, stride, kept, record, filled, flag(chunks <= 1))
 
 
 @solve.def_bwd
@@ -156,7 +157,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
 
 def _backwards(residuals, cotangents, perturbed, numbers, program):
     residuals, numbers = jax.tree.map(jnp.asarray, (residuals, numbers))  # JAX hands constants over as its literals
-    state, moves, chunks, stride, kept, record, filled = residuals
+    state, moves, chunks, stride, kept, record, filled, is_whole = residuals
     times = StepTimes(perturbed, numbers, program)
     recorder = _Recorder(numbers, program, times)
     reverse = ReverseStep(cotangents, perturbed, numbers, program, times)
@@ -170,6 +171,13 @@ def _backwards(residuals, cotangents, perturbed, numbers, program):
         row, accepted = row
         return packing.pack(reverse.step(packing.unpack(packed), recorder.row.unpack(row), accepted))
 
+    def over(record, filled, packed):
+        def one(inner):
+            k, packed = inner
+            return k - 1, apart(k > 0, backwards, packed, read(record, k - 1))
+
+        return lax.while_loop(lambda inner: inner[0] > 0, one, (filled, packed))[1]
+
     def advance(loop):
         q, record, filled, packed = loop
         # The record holds the last chunk. Each one before is taken once more, from the nearest point kept. A count of
@@ -178,14 +186,18 @@ def _backwards(residuals, cotangents, perturbed, numbers, program):
         count = jnp.where(q == chunks - 1, 0, (q - point * stride + 1) * program.chunk)
         again = recorder.run(read(kept, point), blank, None, record, filled, count, jnp.array(False))
         *_, record, filled = again
+        return q - 1, record, filled, over(record, filled, packed)
 
-        def one(inner):
-            k, packed = inner
-            return k - 1, apart(k > 0, backwards, packed, read(record, k - 1))
-
-        _, packed = lax.while_loop(lambda inner: inner[0] > 0, one, (filled, packed))
-        return q - 1, record, filled, packed
-
-    loop = (chunks - 1, record, filled, packing.pack(start))
-    *_, packed = lax.while_loop(lambda loop: loop[0] >= 0, advance, loop)
+    packed = packing.pack(start)
+    if RECORDS_ARE_WHOLE.value:
+        wrong = is_whole != 1  # whoever said so was mistaken
+        packed = over(record, filled, jax.tree.map(lambda leaf: _refused(wrong, leaf), packed))
+    else:
+        loop = (chunks - 1, record, filled, packed)
+        *_, packed = lax.while_loop(lambda loop: loop[0] >= 0, advance, loop)
     return reverse.finish(packing.unpack(packed))
+
+
+def _refused(wrong, leaf):
+    """The leaf; numbers that are none where something is `wrong`."""
+    return jnp.where(wrong, jnp.nan, leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf

@@ -21,6 +21,7 @@ from ..aliases import PyTree
 from ..private_names import MissingName, clear_jitted, private
 from .staging import is_staged, is_traced, layers
 from .tiers import Program
+from .whole_records import RECORDS_ARE_WHOLE, are_whole
 
 
 class Function:
@@ -89,8 +90,13 @@ class Function:
             read = tuple(not isinstance(c, SymbolicZero) for c in cotangents)
             leaves, structure = residuals.leaves, residuals.structure
             n = len(leaves)
+            whole = not is_traced(leaves) and are_whole(leaves)
 
             def pulled(arrays: list[Array]) -> list[PyTree]:
+                with RECORDS_ARE_WHOLE(whole):
+                    return pulled_back(arrays)
+
+            def pulled_back(arrays: list[Array]) -> list[PyTree]:
                 pullback = jax.tree.unflatten(structure, arrays[:n])
 
                 def pulled_by(zeros: list[PyTree]) -> list[PyTree]:
@@ -102,7 +108,7 @@ class Function:
                 except (TypeError, ValueError):  # JAX 0.10.2 takes a stacked zero of a scan for one of its steps
                     return pulled_by([jnp.zeros(c.shape, c.dtype) for c in cotangents])
 
-            transpose = values._derive(("pullback", read, structure), pulled, f"gradient of {self.name}")
+            transpose = values._derive(("pullback", read, structure, whole), pulled, f"gradient of {self.name}")
             found = iter(transpose([*leaves, *(c for c, r in zip(cotangents, read, strict=True) if r)]))
             return tuple(next(found) if k in chosen else None for k in range(len(arrays)))
 

@@ -9,6 +9,7 @@ import pytest
 from problems import compiled, component, rc_circuit, rc_voltage
 from sympy import Eq
 
+import jaxonomy_dae
 from jaxonomy_dae import der, simulate
 from jaxonomy_dae.programs.cache import PROGRAMS
 
@@ -97,3 +98,23 @@ def test_derivatives_of_a_start(compilations):
         np.testing.assert_allclose(jax.vmap(jax.grad(x))(p), first, rtol=1e-12)
         np.testing.assert_allclose(jax.hessian(x)(p[0]), -6 * 2 * first[0] ** 3, rtol=1e-12)
     assert not compilations
+
+
+@pytest.mark.long("two programs that go back")
+def test_runs_that_are_longer_than_their_record():
+    """Whether a run is made again, piece by piece, is known before its derivative is compiled: a derivative of one that
+    fits into its record has no steps to make again, and is not used for a longer one."""
+    count = len(jaxonomy_dae.compilations())
+
+    def end(R, t1):
+        run = simulate(circuit().with_parameters({"r.R": R}), t1, ts=np.array([t1]), dtmax=1e-3, rtol=1e-8, atol=1e-10)
+        return run["c.v"][0]
+
+    for t1 in (0.1, 1.0, 0.2, 2.0):  # 100, 1000, 200 and 2000 steps; a record has 256 rows
+        h = 1e-6
+        exact = (rc_voltage(t1, R=2.0 + h) - rc_voltage(t1, R=2.0 - h)) / (2 * h)
+        np.testing.assert_allclose(jax.grad(end)(2.0, t1), exact, rtol=1e-6)
+    names = [one.name for one in jaxonomy_dae.compilations()[count:]]
+    assert names.count("run") == 1 and names.count("gradient of run") == 2
+    several = jax.vmap(jax.grad(end), in_axes=(0, None))(jnp.array([2.0, 2.0]), 1.0)
+    np.testing.assert_allclose(several, jax.grad(end)(2.0, 1.0), rtol=1e-9)
