@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool
 
 from ..aliases import Args, Controller, PyTree, Solver, State, Terms, Time, Times
 from ..private_names import FOR_LATE_TIMES, missing
+from .closure_conversion import as_traced
 from .wrapped_control import WrappedControl
 
 
@@ -96,7 +97,9 @@ class _LateTimes(diffrax.AbstractAdjoint):
         return self.adjoint.loop(
             **given
             | dict(
-                init_state=dataclasses.replace(state, save_state=state.save_state | {"out": saved}),
+                init_state=dataclasses.replace(
+                    state, save_state=state.save_state | {"out": saved}, result=as_traced(state.result)
+                ),
                 saveat=dataclasses.replace(saveat, subs=saveat.subs | {"out": save}),
             )
         )

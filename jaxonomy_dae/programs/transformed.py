@@ -2,8 +2,9 @@
 
 Under `jax.grad` and `jax.vmap` outside of jit, JAX would compile the derivative or the batch of a compiled function
 with all optimizations. Here both are functions of arrays again, and are compiled as the function itself is. The
-derivative in reverse mode is two programs: the values and all that the pullback needs, and the pullback. Whatever else
-is at work (`jax.jvp`, `jax.jit` around, arrays on several devices, `jax.debug_nans`), JAX transforms the function.
+derivative in reverse mode is two programs: the values and all that the pullback needs, and the pullback. In forward
+mode it is one, and a batch of it for the directions of `jax.jacfwd`. Whatever else is at work (`jax.jit` around, arrays
+on several devices, `jax.debug_nans`), JAX transforms the function.
 """
 
 from collections.abc import Callable, Hashable
@@ -40,12 +41,15 @@ class Function:
         self._transformed: Any = eqx.filter_jit(run)  # for what JAX transforms
         self._program: Program | None = None
         self._derived: dict[Hashable, Function] = {}
+        self.known = 0  # of `_pushed`: the first so many arrays are not directions
 
     def __call__(self, arrays: list[Any]) -> PyTree:
         arrays = [a if isinstance(a, jax.Array) else jax.device_put(a) for a in arrays]  # JAX' own kind of float
         kind = _at_work(arrays)
         if kind == "LinearizeTracer":
             return self._differentiated(arrays)
+        if kind == "JVPTracer":
+            return self._pushed(arrays)
         if kind == "BatchTracer":
             return self._batched(arrays)
         if kind or not _is_plain(arrays):
@@ -116,12 +120,56 @@ class Function:
         smooth = call(*arrays)
         return _combined(smooth, shape[0])
 
+    def _pushed(self, arrays: list[Array]) -> PyTree:
+        """The outcome in forward mode, with respect to the arrays that are traced."""
+        chosen = tuple(k for k, a in enumerate(arrays) if is_traced(a))
+        n = len(arrays)
+
+        def along(arrays: list[Array]) -> PyTree:
+            """(Values, the outcome without them), their derivatives along the last arrays."""
+            split: list[PyTree] = []
+
+            def of(*moved: Array) -> PyTree:
+                given = list(arrays[:n])
+                for k, value in zip(chosen, moved, strict=True):
+                    given[k] = value
+                smooth, rest = eqx.partition(self.function(given), eqx.is_inexact_array)
+                others, fixed = eqx.partition(rest, eqx.is_array)
+                split[:] = [jax.tree.structure(smooth), fixed]
+                return jax.tree.leaves(smooth), others
+
+            smooth, slopes, others = jax.jvp(of, [arrays[k] for k in chosen], arrays[n:], has_aux=True)
+            structure, fixed = split
+            return (smooth, (_Static(structure), eqx.combine(others, fixed))), slopes
+
+        pushed = self._derive(("tangents", chosen), along, f"derivative of {self.name}")
+        pushed.known = n
+        rest: list[PyTree] = []
+
+        @jax.custom_jvp
+        def call(*moved: Array) -> PyTree:
+            raise AssertionError  # JAX calls the rule below
+
+        @call.defjvp
+        def _(moved: PyTree, tangents: PyTree) -> PyTree:
+            given = list(arrays)
+            for k, value in zip(chosen, moved, strict=True):
+                given[k] = value
+            (smooth, rest[:]), slopes = pushed([*given, *tangents])
+            return smooth, slopes
+
+        smooth = call(*(arrays[k] for k in chosen))
+        return _combined(smooth, (rest[0], rest[1]))
+
     def _batched(self, arrays: list[Any]) -> Any:
         """The outcome under one `jax.vmap` of known values."""
         axes = [getattr(a, "batch_dim", None) for a in arrays]
         values = [[*layers(a)][-1] for a in arrays]
         k = next(k for k, axis in enumerate(axes) if axis is not None)
         size = values[k].shape[axes[k]]
+
+        # In `jax.jacfwd`, members differ in their directions alone, and JAX asks for one value of the function.
+        alike = 0 < self.known and all(axis is None for axis in axes[: self.known])
 
         def many(arrays: list[Array]) -> PyTree:
             fixed: list[PyTree] = []
@@ -131,17 +179,24 @@ class Function:
                 fixed[:] = [rest]
                 return moving
 
-            return jax.vmap(one, in_axes=axes, axis_size=size)(*arrays), fixed[0]
+            moving = jax.vmap(one, in_axes=axes, axis_size=size)(*arrays)
+            if alike:
+                moving = (jax.tree.map(lambda rows: rows[0], moving[0]), moving[1])
+            return moving, fixed[0]
 
         moving, rest = self._derive(("batch", size, tuple(axes)), many, f"batch of {self.name}")(values)
+        differs = jax.tree.map(lambda rows: True, moving)
+        if alike:
+            differs = (jax.tree.map(lambda value: False, moving[0]), differs[1])
 
         @jax.custom_batching.custom_vmap
         def member(_: object) -> PyTree:
-            return jax.tree.map(lambda rows: jnp.zeros(rows.shape[1:], rows.dtype), moving)
+            shapes = jax.tree.map(lambda rows, some: rows.shape[some:], moving, differs)
+            return jax.tree.map(lambda rows, shape: jnp.zeros(shape, rows.dtype), moving, shapes)
 
         @member.def_vmap
         def members(size: int, is_batched: PyTree, _: object) -> PyTree:
-            return moving, jax.tree.map(lambda rows: True, moving)
+            return moving, differs
 
         return eqx.combine(member(arrays[k]), rest)
 
@@ -197,6 +252,9 @@ def _at_work(arrays: list[Array]) -> str:
     if any(kind != deepest[len(deepest) - len(kind) :] and kind[:1] != deepest[:1] for kind in kinds):
         return "other"
     if deepest[0] == "LinearizeTracer" or deepest == ("BatchTracer",):
+        return deepest[0]
+    # Numbers that are not differentiable have a derivative of a type of its own, which programs do not take.
+    if deepest == ("JVPTracer",) and all(jnp.issubdtype(a.dtype, jnp.inexact) for a in arrays if is_traced(a)):
         return deepest[0]
     return "other"
 

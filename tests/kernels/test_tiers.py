@@ -231,6 +231,10 @@ TRANSFORMED = {
     "gradients of a batch": lambda f, x, k, ks: jax.vmap(jax.grad(f, 1), (None, 0))(x, ks),
     "gradient of a batch's sum": lambda f, x, k, ks: jax.grad(lambda ks: jax.vmap(f, (None, 0))(x, ks).sum())(ks),
     "forward": lambda f, x, k, ks: jax.jvp(lambda k: f(x, k), (k,), (k,)),
+    "forward by all": lambda f, x, k, ks: jax.jacfwd(f, (0, 1))(x, k),
+    "forward in a batch": lambda f, x, k, ks: jax.vmap(jax.jacfwd(f), (None, 0))(x, ks),
+    "forward of a batch": lambda f, x, k, ks: jax.jvp(lambda ks: jax.vmap(f, (None, 0))(x, ks), (ks,), (ks,)),
+    "forward twice": lambda f, x, k, ks: jax.jacfwd(jax.jacfwd(f))(x, k),
     "second derivative": lambda f, x, k, ks: jax.grad(jax.grad(lambda k: f(x, k)))(k),
     "forward over reverse": lambda f, x, k, ks: jax.jacfwd(jax.grad(lambda k: f(x, k)))(k),
     "jacobian": lambda f, x, k, ks: jax.jacrev(lambda x: f(x, k))(x),
@@ -254,6 +258,15 @@ def test_a_gradient_is_two_programs_and_is_compiled_once():
     for k in (1.1, 1.2, 1.3):
         jax.grad(lambda k: loss(programs, jnp.asarray(X), k))(k)
     assert [name for name, _ in records(since)] == ["wave", "gradient of wave"]
+
+
+@pytest.mark.long("XLA compiles a batch")
+def test_a_jacobian_in_forward_mode_is_one_program_and_is_compiled_once():
+    programs, since = ProgramCache(), len(compilations())
+    for k in map(jnp.asarray, (1.1, 1.2, 1.3)):
+        found = jax.jacfwd(lambda x, k=k: loss(programs, x, k))(jnp.asarray(X))
+        np.testing.assert_allclose(found, jax.jacfwd(plain)(jnp.asarray(X), k), rtol=1e-13)
+    assert [name for name, _ in records(since)] == ["batch of derivative of wave"]
 
 
 def test_cotangents_that_are_zero_are_left_out():
