@@ -152,7 +152,7 @@ def find_equilibrium(
         event = jnp.array(-1)
     else:
         base, root, event = settle(still, still_t, still_inputs, events, begin, search)
-    # What events have not written moves with the starts.
+    # Discrete values that no event has written follow the starts, and so do their derivatives.
     base = base._replace(q=jnp.where(base.changed, base.q, system.discrete_values))
     w, matrix = root.w, root.jacobian
 

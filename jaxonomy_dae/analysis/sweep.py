@@ -58,7 +58,7 @@ class Sweep(eqx.Module):
         for name, values in self.axes.items():
             array = np.asarray(values)
             entries = tuple(f"{name}_{k}" for k in range(array.ndim - 1))
-            # What has more dimensions than one cannot be the coordinate of the dimension of its name.
+            # An array of more than one dimension cannot be the coordinate of the dimension of its name.
             label = name if array.ndim == 1 else f"{name} values"
             coordinates[label] = (("case" if self.zipped else name, *entries), array)
         if isinstance(self.values, Solution):

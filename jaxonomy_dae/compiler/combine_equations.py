@@ -200,7 +200,7 @@ def combine(
             left = ZERO_NODE
             if label in without.leaves and label not in gone:
                 left = _sum_of_terms([partial_derivative(without, label)])
-            # What is zero on one branch need not be so on another.
+            # An expression that is zero on one branch need not be zero on another.
             if number(left) == 0 or (not has_branches(left) and samples.is_rounding(left)):
                 cancelled.append(label)
             else:

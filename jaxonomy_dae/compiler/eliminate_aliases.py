@@ -98,8 +98,8 @@ def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], Alia
         if (found == ZERO).all():
             rows = np.unique(terms.row) if sweep >= SWEEPS else _short(terms, n_rows)
             short = terms.take(np.isin(terms.row, rows))
-            # What is equal goes before what is a multiple, so that the order of equations does not decide whether a
-            # velocity is named by its position or a position by its acceleration (v = x' and v' = −k·x).
+            # Equal variables are joined before multiples of each other, so that the order of equations does not decide
+            # whether a velocity is named by its position or a position by its acceleration (v = x' and v' = −k·x).
             found = _follow(short, n_rows, classes, multiples=False)
             if (found == ZERO).all():
                 found = _follow(short, n_rows, classes, multiples=True)

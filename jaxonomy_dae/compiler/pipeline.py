@@ -59,21 +59,26 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
 
     - `ModelError`, `StructuralError` as `AcausalCompiler`.
     """
+    # The graph passes below see one column for each quantity that is left, whatever its number of names.
     groups, alias = eliminate_aliases(flat)
     columns = number_columns(flat, alias)
     signature = incidence(groups, columns.number, columns.n_unknown)
+    # One matching serves twice: it shows missing and excess equations here, and index reduction starts from it.
     matching = match_highest(signature, columns.least_of_unknown)
     check_structure(flat, groups, alias, signature, columns.unknown, matching)
+    # Starts are compared in the equations that the user wrote, before any are combined.
     equal = check_equal_starts(flat, groups, alias)
 
     groups, signature, offsets, cancelled = reduce_with_cancellation(
         groups, signature, columns, matching, flat.parameters, flat.declares.values
     )
+    # Only now is it known which equation alone determines which highest derivative: its coefficient must not be zero.
     check_pivots(groups, signature, offsets, columns, flat.parameters, flat.declares.values)
     extended = differentiate_equations(groups, offsets, columns)
     model = ReducedModel(flat, alias, groups, extended, map_quantities(alias, extended.quantities))
 
     selection = select_states(model, mode, merits(model, prefer_states))
+    # Blocks are those of the unknowns that are neither states nor inputs, so they follow the selection.
     blocks = order_blocks(model, selection)
     _check_row_targets(model, selection, mode)
     notes = (

@@ -115,7 +115,7 @@ def _cancelled_alone(jacobian: HighestDerivatives) -> np.ndarray:
             continue
         partials, errors = jacobian.partials(g, 0)
         total, bound = (highest * partials).sum(axis=1), (highest * errors).sum(axis=1)
-        # What has no value at this point is asked at others.
+        # Equations without a value at this point are evaluated at others.
         found.append(own[several & ~(np.abs(total) > bound)])
     return np.concatenate(found)
 

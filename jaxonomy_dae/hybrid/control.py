@@ -42,7 +42,7 @@ class EventControl(WrappedControl):
         start = jnp.where(early, t0, start)
         end = jnp.where(early, request, end)
         due = jnp.where(kept, _due(y1), _due(y0))
-        # What is cut short for a clock goes on with its own step size.
+        # A step that is cut short for a clock is followed by one of the size that the controller had chosen.
         cut = end > due
         wished = jnp.where(early, t1 - t0, jnp.where(keep, jnp.inf, wished))
         wished = jnp.where(cut & ~early, h, wished)

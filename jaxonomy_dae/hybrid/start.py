@@ -73,7 +73,7 @@ def start(
         return state
     due_conditions = due_conditions & at_once
     due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
-    # What holds at the start need not be near zero.
+    # Guards of conditions that hold at the start need not be near zero.
     slope = jnp.zeros_like(x0) if resumed is None else problem.slope(t0, x0, q0, args)
     arrival = Arrival(slope, rate, due, due_conditions, size, tolerance, tolerance)
     state, _, table = handle(problem, t0, state, arrival, args, table, at_start=resumed is None)

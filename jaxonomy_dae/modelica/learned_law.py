@@ -41,7 +41,7 @@ def _read(m: Component, written: Any) -> list[Any]:
 
 def law_of(name: str, law: Any, inputs: Sequence[str], beside: bool) -> Law:
     """A law from a network, or from a function of the component and the written value."""
-    if isinstance(law, eqx.Module):
+    if isinstance(law, eqx.Module) and callable(law):
         return LearnedLaw(name, law, tuple(inputs), beside)
     if not callable(law):
         raise ModelError(f"the law of '{name}' is a network, or a function law(component, written value); got {law!r}")

@@ -28,7 +28,7 @@ from .symbols import DiscreteSymbol, PreviousSymbol, RelationSymbol, VariableSym
 class EventDeclarations:
     """The part of `Component` that concerns events."""
 
-    # What the rest of it has.
+    # Attributes and methods of the other parts of `Component`.
     ev: EqnEnv
     name: str
     path: str

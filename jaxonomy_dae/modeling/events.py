@@ -154,7 +154,7 @@ def guard_of(condition: Condition, where: str) -> sympy.Expr:
     if _is_discrete(condition):
         return sympy.Piecewise((-1, condition), (1, True))
     if isinstance(condition, sympy.And | sympy.Or):
-        # What only events change switches the guard of the others on or off.
+        # Relations in discrete variables alone switch the guard of the others on or off.
         fixed = [c for c in condition.args if _is_discrete(c)]
         others = [guard_of(c, where) for c in condition.args if not _is_discrete(c)]
         if isinstance(condition, sympy.And):

@@ -89,8 +89,8 @@ class ModeDeclarations(RelationDeclarations):
             self._event(force <= 0, (Assign(active, sympy.Integer(0)),), closed, chooses)
             self._event(gap <= 0, (Assign(active, sympy.Integer(1)),), open_, chooses)
             return active
-        # What has just been let go is within rounding of the gap, and would be caught again: until it has lifted, it
-        # must go through the clearance.
+        # A part that was just released is within rounding of the gap, and would be caught again. Until it has lifted by
+        # the clearance, it must go as far beyond zero to be caught.
         lifted = self._hidden_discrete(0.0)
         yes, no = sympy.Integer(1), sympy.Integer(0)
         depth = sympy.Piecewise((0, sympy.Eq(lifted, 1)), (clearance, True))
