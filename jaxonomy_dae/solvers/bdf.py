@@ -1,6 +1,7 @@
 """BDF: variable order, variable step, fixed leading coefficient."""
 
-from typing import ClassVar
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..aliases import Numeric, PyTree, State, Time
 from ..errors import ModelError
@@ -60,6 +61,29 @@ class _History(eqx.Module):
     contraction: Float[Array, ""]  # ρ/(1−ρ) of the last Newton iterations
     counts: Int[Array, "2"]  # Jacobians (and factorisations), Newton iterations
     largest: Numeric  # of the determinants measured, each; None if there are none
+
+
+class _Tried(NamedTuple):
+    """An attempted step: differences, the change from the prediction, its size and order, whether order and size still
+    rise, whether it was rejected before, and whether Newton's method converged where it may go."""
+
+    phi: Float[Array, "rows n"]
+    e: Float[Array, " n"]
+    h: Float[Array, ""]
+    order: Int[Array, ""]
+    starting: Bool[Array, ""]
+    retried: Bool[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class _Ahead(NamedTuple):
+    """Whether the step is accepted; order and size of the next one, the size as a factor of this one's."""
+
+    accepted: Bool[Array, ""]
+    order: Int[Array, ""]
+    steady: Int[Array, ""]
+    starting: Bool[Array, ""]
+    factor: Float[Array, ""]
 
 
 class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
@@ -207,22 +231,53 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
             verdict = self.guard.judge(largest, t1, problem.unravel(y1), args)
             allowed, largest, result = verdict.allowed, verdict.largest, verdict.result(result)
 
-        # Error estimates at this order and its neighbours, after Brenan, Campbell & Petzold, eq. 5.2.31 ff.
         still = jax.lax.stop_gradient
         count_all = problem.mass.is_diagonal if self.algebraic_errors is None else self.algebraic_errors
-        phi_, e_ = still(phi), still(e)
-        k = order
 
         # Algebraic unknowns left out of the error test are those of `algebraic_errors=False`: they are solved for, and
         # have no error of their own at the ends of steps.
         def size(v):
             return norm(weight * (v if count_all else problem.mass.differential_part(v)))
 
+        tried = _Tried(still(phi), still(e), still(h), order, starting, retried, solved.converged & allowed)
+        ahead = self._ahead(state, c, tried, size)
+
+        updated = _advance(phi, e, order, self.max_order)
+        h_ = still(h)
+        new_state = _History(
+            phi=updated,
+            psi=c.psi,
+            order=ahead.order,
+            last_order=order,
+            steady=ahead.steady,
+            last_step=h_,
+            planned=h_ * ahead.factor.astype(h_.dtype),
+            starting=ahead.starting,
+            factor=solved.factor,
+            factor_cj=solved.factor_cj,
+            last_cj=still(cj),
+            contraction=solved.contraction,
+            counts=state.counts + jnp.stack([solved.factorisations, solved.iterations]),
+            largest=largest,
+        )
+        # The controller divides the error by the same scale, which must be finite where y1 is not.
+        value = jnp.where(jnp.isfinite(y1), y1, y)
+        scale = atol + jnp.maximum(jnp.abs(y), jnp.abs(value)) * rtol
+        y_error = encoded(ahead.factor, ahead.accepted) * still(jnp.broadcast_to(scale, y.shape))
+        # Diffrax fills unused rows with infinity, which integers do not have.
+        dense = dict(y0=y0, phi=jax.vmap(problem.unravel)(updated), psi=c.psi, order=order.astype(c.psi.dtype))
+        return problem.unravel(y1), problem.unravel(y_error), dense, new_state, result
+
+    def _ahead(self, state: _History, c: Coefficients, tried: _Tried, size: Callable[[Array], Array]) -> _Ahead:
+        """Accepts or rejects the step and chooses order and size of the next one, by error estimates at this order and
+        its neighbours (Brenan, Campbell & Petzold, eq. 5.2.31 ff)."""
+        phi_, e_, k, dtype = tried.phi, tried.e, tried.order, tried.phi.dtype
+
         def row(j):
             return phi_[jnp.clip(j, 0, ROWS - 1)]
 
         def sigma(j):
-            return c.sigma[jnp.clip(j, 0, ROWS - 1)].astype(y.dtype)
+            return c.sigma[jnp.clip(j, 0, ROWS - 1)].astype(dtype)
 
         e_norm = size(e_)
         lower = row(k) + e_
@@ -230,19 +285,19 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         err = sigma(k) * e_norm
         err_1 = sigma(k - 1) * size(lower)
         err_2 = sigma(k - 2) * size(lowest)
-        kf = k.astype(y.dtype)
+        kf = k.astype(dtype)
         total, total_1, total_2 = (kf + 1) * err, kf * err_1, (kf - 1) * err_2
         fall = jnp.where(k > 2, jnp.maximum(total_1, total_2) <= total, (k == 2) & (total_1 <= 0.5 * total))
         # Where nothing moves all estimates are zero. The order then rises all the same: the run may be differentiated,
         # and the motion after a small push, which the derivative is, needs a high order.
         fall = fall & (total > 0)
-        accepted = solved.converged & allowed & (c.test.astype(y.dtype) * e_norm < 1.0)
+        accepted = tried.converged & (c.test.astype(dtype) * e_norm < 1.0)
 
-        same = jnp.abs(still(h) - state.last_step) <= 1e-6 * state.last_step
+        same = jnp.abs(tried.h - state.last_step) <= 1e-6 * state.last_step
         steady = jnp.where(same & (k == state.last_order), state.steady, 0)
         steady = jnp.minimum(steady + 1, state.last_order + 2)
         # At first, order and size rise with every step until an estimate says that a lower order would do.
-        starting = starting & ~fall & (k < self.max_order)
+        starting = tried.starting & ~fall & (k < self.max_order)
         err_up = size(e_ - row(k + 1)) / (kf + 2)
         total_up = (kf + 2) * err_up
         stay = (k == self.max_order) | (k + 1 >= steady) | (k - state.last_order == 1)
@@ -259,38 +314,13 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         next_order = jnp.clip(next_order, 1, self.max_order)
         # IDA's rule: the step stays, so that its factorisation does, unless it may double or must shrink. The estimate
         # is doubled for safety, and 1e-4 keeps the quotient finite where nothing moves.
-        wish = (2 * estimate + 1e-4) ** (-1 / (next_order.astype(y.dtype) + 1))
+        wish = (2 * estimate + 1e-4) ** (-1 / (next_order.astype(dtype) + 1))
         factor = jnp.where(wish >= 2, 2.0, jnp.where(wish <= 1, jnp.clip(wish, 0.5, 0.9), 1.0))
         factor = jnp.where(starting, jnp.where(first, 1.0, 2.0), factor)
         again = 0.9 * (2 * err + 1e-4) ** (-1 / (kf + 1))
-        again = jnp.where(solved.converged & allowed & ~retried, jnp.clip(again, 0.25, 0.9), 0.25)
+        again = jnp.where(tried.converged & ~tried.retried, jnp.clip(again, 0.25, 0.9), 0.25)
         factor = jnp.where(accepted, factor, jnp.where(jnp.isfinite(again), again, 0.25))
-
-        updated = _advance(phi, e, k, self.max_order)
-        h_ = still(h)
-        new_state = _History(
-            phi=updated,
-            psi=c.psi,
-            order=next_order,
-            last_order=k,
-            steady=steady.astype(jnp.int32),
-            last_step=h_,
-            planned=h_ * factor.astype(h_.dtype),
-            starting=starting,
-            factor=solved.factor,
-            factor_cj=solved.factor_cj,
-            last_cj=still(cj),
-            contraction=solved.contraction,
-            counts=state.counts + jnp.stack([solved.factorisations, solved.iterations]),
-            largest=largest,
-        )
-        # The controller divides the error by the same scale, which must be finite where y1 is not.
-        value = jnp.where(jnp.isfinite(y1), y1, y)
-        scale = atol + jnp.maximum(jnp.abs(y), jnp.abs(value)) * rtol
-        y_error = encoded(factor, accepted) * still(jnp.broadcast_to(scale, y.shape))
-        # Diffrax fills unused rows with infinity, which integers do not have.
-        dense = dict(y0=y0, phi=jax.vmap(problem.unravel)(updated), psi=c.psi, order=k.astype(c.psi.dtype))
-        return problem.unravel(y1), problem.unravel(y_error), dense, new_state, result
+        return _Ahead(accepted, next_order, steady.astype(jnp.int32), starting, factor)
 
 
 def ravel_like(y: State) -> Float[Array, " n"]:

@@ -101,34 +101,12 @@ def implicit_step(
             # An old factorisation belongs to another c_j, which this factor makes up for (section 5.2.2).
             scale = (2 / (1 + cj / factor_cj)).astype(dtype)
 
-            def iterate(inner):
-                y, m, first, contraction, _, _ = inner
-                change = -scale * linear.apply(factor, None, residual(y))
-                size = norm(change * weight)
-                first = jnp.where(m == 0, size, first)
-                rate = jnp.where(
-                    m == 0, 0.0, (size / jnp.where(first == 0, 1, first)) ** (1 / jnp.maximum(m, 1).astype(dtype))
-                )
-                failed = ~jnp.isfinite(size) | (rate > DIVERGED)
-                contraction = jnp.where(m == 0, contraction, jnp.where(failed, contraction, rate / (1 - rate)))
-                small = jnp.where(m == 0, size <= 1e-4 * CONVERGED, False)
-                done = (small | (contraction * size <= CONVERGED)) & ~failed
-                return y + change, m + 1, first, contraction, done, failed
+            def change(y):
+                return -scale * linear.apply(factor, None, residual(y))
 
-            def going(inner):
-                _, m, _, _, done, failed = inner
-                return ~done & ~failed & (m < max_iterations)
-
-            zero = jnp.zeros((), dtype)
-            start = (
-                predicted,
-                jnp.array(0, jnp.int32),
-                zero,
-                contraction.astype(dtype),
-                jnp.array(False),
-                jnp.array(False),
+            y, m, contraction, done = _iterated(
+                change, predicted, contraction.astype(dtype), lambda v: norm(v * weight), max_iterations
             )
-            y, m, _, contraction, done, _ = jax.lax.while_loop(going, iterate, start)
             contraction = contraction.astype(cj.dtype)
             out = y, factor, factor_cj, contraction, made + renew.astype(jnp.int32), iterations + m
             return done, out
@@ -170,3 +148,33 @@ def implicit_step(
     y, rest = root(right, t, predicted, slope, cj, still((factor, factor_cj, last_cj, contraction, weight)))
     done, factor, factor_cj, contraction, made, iterations = still(rest)
     return Solved(y, done, factor, factor_cj, contraction, made.astype(jnp.int32), iterations.astype(jnp.int32))
+
+
+def _iterated(
+    change: Callable[[Array], Array], start: Array, contraction: Array, size: Callable[[Array], Array], most: int
+) -> tuple[Array, Array, Array, Array]:
+    """Newton's iteration by the steps `change(y)`. Returns (y, the number of steps, ρ/(1−ρ) of the last ones, whether
+    it converged)."""
+    dtype = start.dtype
+
+    def iterate(inner):
+        y, m, first, contraction, _, _ = inner
+        step = change(y)
+        length = size(step)
+        first = jnp.where(m == 0, length, first)
+        mean = (length / jnp.where(first == 0, 1, first)) ** (1 / jnp.maximum(m, 1).astype(dtype))
+        rate = jnp.where(m == 0, 0.0, mean)
+        failed = ~jnp.isfinite(length) | (rate > DIVERGED)
+        contraction = jnp.where(m == 0, contraction, jnp.where(failed, contraction, rate / (1 - rate)))
+        small = jnp.where(m == 0, length <= 1e-4 * CONVERGED, False)
+        done = (small | (contraction * length <= CONVERGED)) & ~failed
+        return y + step, m + 1, first, contraction, done, failed
+
+    def going(inner):
+        _, m, _, _, done, failed = inner
+        return ~done & ~failed & (m < most)
+
+    no = jnp.array(False)
+    begin = start, jnp.array(0, jnp.int32), jnp.zeros((), dtype), contraction, no, no
+    y, m, _, contraction, done, _ = jax.lax.while_loop(going, iterate, begin)
+    return y, m, contraction, done
