@@ -37,35 +37,32 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
     """Differentiates the numerical solution itself, step by step backwards, from a record of the accepted steps.
 
     Gradients are those of `diffrax.RecursiveCheckpointAdjoint`, to rounding, at a small multiple of the cost of the
-    solve. What a step started from is recorded during the solve, in a table of 64 to 256 rows; in a batch, of 32 to
-    256, fewer the more members it has. Where a solve takes more steps than rows, it is run once more in pieces, from
-    points kept on the way (checkpointing with two levels, Griewank & Walther 2008, Evaluating Derivatives, chapter 12).
-    Memory hardly grows with `max_steps`, and without differentiation nothing is recorded. Tables to which steps append
-    rows, such as the log of events, are kept once, and no part of what is recorded.
+    solve. During the solve, the start of each step is recorded in a table of 64 to 256 rows, in a large batch of fewer
+    rows, at least 32. If a solve takes more steps than rows, it is repeated in pieces from stored points (checkpointing
+    with two levels, Griewank & Walther 2008, Evaluating Derivatives, chapter 12). Memory hardly grows with `max_steps`,
+    and without differentiation nothing is recorded. Tables to which steps append rows, such as the log of events, are
+    stored once and are not part of the record.
 
-    Where a component of the state rests, its error is zero, and steps would grow without limit; the derivative, which
-    is the motion after a small push, would not be resolved. While any rests, whatever else moves, a run that is
-    differentiated takes along a second one that was given such a push, and its steps are not longer than that one's
-    error allows.
+    If a component of the state rests, its error is zero, and steps could grow without limit. They would not resolve the
+    derivative, which is the motion after a small push. Therefore a differentiated run integrates a second, pushed
+    solution while any component rests, and the error of that solution limits the steps, too.
 
-    Rejected steps take no part, so what is not finite in them does no harm. Step sizes count as constant, except where
-    they follow from the times given: derivatives with respect to `t0`, `t1`, `dt0`, `SaveAt(ts=...)` and the times of
-    `diffrax.ClipStepSizeController` and `diffrax.StepTo` are complete.
+    Rejected steps do not enter the derivative, so values in them need not be finite. Step sizes count as constant,
+    except where they follow from given times: derivatives with respect to `t0`, `t1`, `dt0`, `SaveAt(ts=...)` and the
+    times of `diffrax.ClipStepSizeController` and `diffrax.StepTo` are complete.
 
-    Solves with events, dense output or Brownian motion, and those whose state is so large that a record would take more
-    than 32 MB, are handed to `diffrax.RecursiveCheckpointAdjoint`; so are all, with a `RuntimeWarning`, where a version
-    of Diffrax, Equinox or JAX lacks a private name that this relies on. As with that, forward mode alone is refused:
-    use `diffrax.ForwardMode()`.
+    `diffrax.RecursiveCheckpointAdjoint` takes over for solves with events, dense output or Brownian motion, and for
+    records above 32 MB. It also does, with a `RuntimeWarning`, if the versions of Diffrax, Equinox or JAX lack a
+    private name that is needed. Forward mode alone is refused: use `diffrax.ForwardMode()`.
 
-    Second derivatives are forward mode over reverse mode: `jax.hessian`, or `jax.jvp` of `jax.grad`. They need a step
-    that forward mode can follow, as it can those of this package's solvers. Diffrax's Runge–Kutta methods loop over
-    their stages, and forward mode can follow if told to: `diffrax.Dopri5(scan_kind="bounded")`.
+    Second derivatives are forward mode over reverse mode: `jax.hessian`, or `jax.jvp` of `jax.grad`. They need steps
+    that forward mode can differentiate, such as those of this package's solvers. Diffrax's Runge–Kutta methods loop
+    over their stages and need an option for it: `diffrax.Dopri5(scan_kind="bounded")`.
 
     **Arguments:**
 
-    - `members`: of the batch in which the solve is one, where `jax.vmap` cannot be seen from inside: in
-        `jax.vmap(jax.jit(f))`.
-    - `known`: that all values are known, so that nothing will be differentiated.
+    - `members`: the size of the batch, for `jax.vmap(jax.jit(f))`, where the solve cannot see `jax.vmap`.
+    - `known`: whether all values are known, so that nothing will be differentiated.
     """
 
     members: int = eqx.field(static=True, default=1)

@@ -83,9 +83,9 @@ class _Pressed(Component):
 class Clutch(_Pressed, AboutAxis, Compliant):
     """Two shafts pressed together: the input `u` is the normal force as a part of `fn_max`.
 
-    While they slide, tau = mode·mu·cgeo·fn with fn = fn_max·max(u, 0); they stick until |tau| reaches peak times that;
-    w_rel = der(flange_b.phi − flange_a.phi). `mu`, `fn_max` (newton), `cgeo` (metre) ≥ 0; `peak` ≥ 1. Shafts that are
-    pressed together at a speed below the parameter `standstill` (rad/s) stick at once.
+    While they slide, tau = mode·mu·cgeo·fn with fn = fn_max·max(u, 0); they stick until |tau| reaches `peak` times this
+    torque; w_rel = der(flange_b.phi − flange_a.phi). `mu`, `fn_max` (newton), `cgeo` (metre) ≥ 0; `peak` ≥ 1. Shafts
+    that are pressed together at a speed below the parameter `standstill` (rad/s) stick at once.
     """
 
     def __init__(

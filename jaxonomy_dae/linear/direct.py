@@ -77,8 +77,8 @@ class _AbstractDirect(lx.AbstractLinearSolver[_State]):
 
 
 class WrittenOut(_AbstractDirect):
-    """Elimination written out, with row-scaled partial pivoting by selection: no call of LAPACK and no branch, so a
-    `vmap` over many small systems is vectorised. For up to 6 unknowns."""
+    """Unrolled elimination, with row-scaled partial pivoting by selection. It has no call of LAPACK and no branch, so a
+    `vmap` over many small systems is vectorized. For up to 6 unknowns."""
 
     def _kept(self, operator):
         n = operator.in_size()
@@ -109,7 +109,7 @@ class KLU(_AbstractDirect):
     """KLU (Davis & Palamadai Natarajan 2010, ACM TOMS 37:36), a sparse LU made for circuits, for a
     `SparseLinearOperator`. Needs the extra `sparse` and 64-bit mode.
 
-    It factorises anew at each solve, which costs about as much as reading a stored factorisation would.
+    It factorizes at each solve, which costs about as much as loading a stored factorization.
     """
 
     def _kept(self, operator):

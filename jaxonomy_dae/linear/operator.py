@@ -16,7 +16,7 @@ from .sparse import SparsePattern
 class SparseLinearOperator(lx.AbstractLinearOperator):
     """The matrix with the entries `values` at the places of `pattern`.
 
-    Any Lineax solver takes it; `KLU` solves with it without filling it, `lineax.GMRES` without looking inside.
+    Any Lineax solver accepts it. `KLU` solves with its sparse entries, and `lineax.GMRES` only multiplies by it.
 
     **Arguments:**
 

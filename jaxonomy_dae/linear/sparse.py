@@ -201,15 +201,16 @@ def solve_sparse(
 ) -> Float[Array, " n"]:
     """x with A·x = b (or Aᵀ·x = b), A square and regular, its entries `values` at the places of `pattern`.
 
-    Differentiable any number of times with respect to `values` and `b` by the implicit function theorem, in forward and
-    reverse mode; may stand in `jit`, loops and `vmap`. Not-a-number in gives not-a-number out.
+    It is differentiable any number of times with respect to `values` and `b` by the implicit function theorem, in
+    forward and reverse mode, and works in `jit`, loops and `vmap`. Not-a-number in the input gives not-a-number in the
+    output.
 
     **Raises:**
 
     - `MissingSparseSolver` if `klujax` is not installed.
     - `ValueError` without 64-bit mode: KLU computes in float64.
     - When run: JAX's run-time error "singular matrix" if entries cancel to a pivot of exactly zero; `nudged` avoids it
-        by changing every entry by a few units in its last place. Entries that vanish give what is not finite.
+        by changing every entry by a few units in its last place. Zero entries give results that are not finite.
     """
     if pattern.n_rows != pattern.n:
         raise ModelError(f"a matrix to be solved with must be square; this one is {pattern.n_rows} × {pattern.n}")

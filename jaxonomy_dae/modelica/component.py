@@ -23,13 +23,13 @@ class FlatComponent(Component):
     - `ev`: the model's `EqnEnv`.
     - `name`: the component's name.
     - `flat`: the model, as `load` returns it.
-    - `outputs`: names of Boolean and Integer variables to be found in the solution. Those that a `when` assigns, and
-        those of which `pre(…)` is read, are there anyway.
+    - `outputs`: names of Boolean and Integer variables that the solution shall contain. It always contains those that a
+        `when` assigns or `pre(…)` reads.
 
     **Raises:**
 
-    - `ModelError` for what cannot be translated, with its line in the text; for a law, of `flat.replace` or
-        `flat.add_term`, of a variable that no equation, or more than one, gives by itself.
+    - `ModelError` for constructs that cannot be translated, with the line of the text; and for a law, of `flat.replace`
+        or `flat.add_term`, of a variable that is not defined by exactly one equation of the form `variable = …`.
     """
 
     def __init__(self, ev: EqnEnv, name: str, flat: FlatModel, outputs: Sequence[str] = ()):

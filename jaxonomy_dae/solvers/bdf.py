@@ -92,11 +92,11 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     Variable step, fixed leading coefficient: the formulas, the error estimates and the choice of order are those of
     Brenan, Campbell & Petzold (1996), Numerical Solution of Initial-Value Problems in Differential-Algebraic Equations,
     chapter 5, with the step-size rules of SUNDIALS IDA (Hindmarsh et al. 2005, ACM TOMS 31:363). The corrector is a
-    modified Newton iteration whose factorisation is kept over steps, renewed where the leading coefficient has changed
-    too much or the iteration fails, and then tried again inside the step.
+    modified Newton iteration that keeps its factorization over steps. The factorization is renewed, within the step, if
+    the leading coefficient has changed too much or the iteration fails.
 
-    Gradients are those of the implicit equations, linearised afresh at their solution: how Newton got there, with which
-    Jacobian, does not show.
+    Gradients are those of the implicit equations, linearized at their solution. They do not depend on the Newton
+    iteration and its Jacobian.
 
     **Arguments:**
 
@@ -104,11 +104,11 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     - `fixed_order`: stay at `max_order` once it is reached; for convergence studies.
     - `linear_solver`: any Lineax solver, such as `lineax.GMRES(rtol, atol)`, or one of `jaxonomy_dae.linear`; None
         chooses by size. It receives a `SparseLinearOperator` where the term has a pattern.
-    - `algebraic_errors`: whether the error test counts what is not differentiated. If not, there
-        are fewer steps (often far fewer where M is not diagonal), and their ends are as accurate; but nothing checks
-        the dense output of an algebraic unknown that varies faster than the rest. None counts it where M is diagonal,
-        except in `simulate`, which solves the algebraic equations again at saved times.
-    - `rtol`, `atol`, `norm`: given where the step-size controller has none; else left out.
+    - `algebraic_errors`: whether the error test includes algebraic unknowns. Without them there are fewer steps (often
+        far fewer if M is not diagonal), and their ends are as accurate. But then nothing checks the dense output of an
+        algebraic unknown that varies faster than the rest. None counts it where M is diagonal, except in `simulate`,
+        which solves the algebraic equations again at saved times.
+    - `rtol`, `atol`, `norm`: give them only if the step-size controller has none.
     - `projection`: `(t, y, args) -> y`, onto hidden constraints: applied inside the step, before the history is
         updated. `simulate` fills it in.
     - `guard`: as in `Projected`.

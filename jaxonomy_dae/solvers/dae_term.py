@@ -21,10 +21,10 @@ from ..private_names import unwrapped
 class DAETerm(diffrax.AbstractTerm):
     """A differential-algebraic equation, for `BDF` and `Rodas5P`.
 
-    - `DAETerm(f, g)`: dx/dt = f(t, x, z, args), 0 = g(t, x, z, args). The solution is the pair `(x, z)`; f returns
-        what x looks like, g as many values as z has.
+    - `DAETerm(f, g)`: dx/dt = f(t, x, z, args), 0 = g(t, x, z, args). The solution is the pair `(x, z)`; f returns the
+        structure of x, and g as many values as z has.
     - `DAETerm(F, mass=M)`: M dy/dt = F(t, y, args) with a constant matrix M, shape (n, n), or its diagonal, shape (n,);
-        M may be singular. F returns what y looks like.
+        M may be singular. F returns the structure of y.
 
     Both must have index 1: ∂g/∂z regular. `jaxonomy_dae.AcausalCompiler` reduces higher indices.
 

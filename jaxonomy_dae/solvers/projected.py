@@ -29,10 +29,9 @@ class Projected(WrappedSolver):
 
     - `solver`: any Diffrax solver.
     - `projection`: a function `(t, y, args) -> y` such as `system.project`; `simulate` fills it in if left out.
-    - `strict`: whether the distance moved counts as an error of the step. A step that has slipped to another branch of
-        an implicit function is then rejected, however well its own error estimate looks.
-    - `guard`: ends the run with `RESULTS.singular` where a minimal set of states becomes a singular choice. `simulate`
-        fills it in.
+    - `strict`: whether the distance moved counts as an error of the step. A step that slips to another branch of an
+        implicit function is then rejected, even if its own error estimate is small.
+    - `guard`: ends the run with `RESULTS.singular` if a minimal set of states becomes singular. `simulate` fills it in.
     """
 
     solver: AbstractSolver

@@ -111,19 +111,19 @@ class Rodas5PInterpolation(diffrax.AbstractLocalInterpolation):
 class Rodas5P(diffrax.AbstractAdaptiveSolver):
     """Rosenbrock method of order 5(4) for M dy/dt = F(t, y), index 1, and for stiff ordinary equations.
 
-    Eight stages, stiffly accurate, L-stable, with one Jacobian and one factorisation a step and no iteration: what it
-    returns is an explicit formula, so gradients are exact. The natural choice for small stiff systems and batches.
-    Steinebach (2023), BIT Numerical Mathematics 63:27.
+    Eight stages, stiffly accurate, L-stable, with one Jacobian and one factorization a step and no iteration. The
+    result is an explicit formula, so gradients are exact. Use it for small stiff systems and for batches. Steinebach
+    (2023), BIT Numerical Mathematics 63:27.
 
     **Arguments:**
 
     - `linear_solver`: any Lineax solver, such as `lineax.GMRES(rtol, atol)`, or one of `jaxonomy_dae.linear`; None
         chooses by size. It receives a `SparseLinearOperator` where the term has a pattern.
 
-    - `dense_errors`: whether the error test counts the dense output of differentiated unknowns inside of a step, too,
-        by its defect there: one more evaluation. Without, what is very stiff is right at the ends of steps, which may
-        then be so long that the polynomial between them is not. `simulate` and `solve_dae` ask for it where times to
-        save are given; algebraic unknowns they solve for again at these times.
+    - `dense_errors`: whether the error test includes the dense output of differentiated unknowns inside a step, by its
+        defect: one more evaluation. Without it, very stiff unknowns are accurate at the ends of steps, but steps may be
+        so long that the polynomial between them is not. `simulate` and `solve_dae` set it if there are times to save,
+        and solve for algebraic unknowns again at these times.
 
     - `looped`: whether to loop over the stages; None decides by the size of F.
 

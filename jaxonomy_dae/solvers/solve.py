@@ -63,22 +63,23 @@ def solve_dae(
 
     - `term`: a `DAETerm` (or a `diffrax.ODETerm`).
     - `t0`, `t1`: the interval.
-    - `y0`: the start, consistent: `consistent_start` makes it so. The pair `(x, z)` for `DAETerm(f, g)`.
+    - `y0`: a consistent start, see `consistent_start`. It is the pair `(x, z)` for `DAETerm(f, g)`.
     - `ts`: when to save; None saves the end alone.
     - `solver`: default `Rodas5P` up to 30 unknowns, `BDF` beyond.
     - `rtol`, `atol`: of the local error, by default 1e-6 and 1e-8 (1e-4 and 1e-6 in single precision); `atol` may look
         like y.
-    - `args`: handed to the functions; gradients flow to it.
-    - `adjoint`: how to differentiate; default `StoredAdjoint()`, and `diffrax.ForwardMode()` under `jax.jvp` and
-        `jax.jacfwd`; name the latter for a function that is jitted before it is differentiated.
+    - `args`: the last argument of the functions. It can be differentiated.
+    - `adjoint`: how to differentiate. The default is `StoredAdjoint()`, and `diffrax.ForwardMode()` under `jax.jvp` and
+        `jax.jacfwd`. Give `diffrax.ForwardMode()` yourself if a function is jitted before it is differentiated in
+        forward mode.
     - `stepsize_controller`, `max_steps`: of Diffrax.
-    - `jump_ts`: times at which F jumps, a number or shape (n,): steps end there and the method starts anew.
+    - `jump_ts`: times at which F jumps, a number or shape (n,). Steps end there, and the method restarts.
     - `dtmax`: the longest step.
     - `names`: of the unknowns, in order, for error messages.
-    - `throw`: whether to raise if the start is inconsistent or the integration fails. Otherwise `solution.result` has a
-        code, rows that were not reached are NaN, and so are their derivatives. None: outside jit and vmap; `jax.vmap`
-        outside of jit warns, with the numbers of the members that failed. Inside jit, True puts callbacks to the host
-        into the program, which JAX's persistent compilation cache then does not keep.
+    - `throw`: whether to raise an error if the start is inconsistent or the integration fails. With False,
+        `solution.result` has a code, and rows that were not reached are NaN, with their derivatives. None raises
+        outside jit and vmap; `jax.vmap` outside of jit warns and names the members that failed. Inside jit, True puts
+        callbacks to the host into the program, and JAX's persistent cache does not keep such programs.
 
     **Returns:**
 
@@ -88,7 +89,7 @@ def solve_dae(
 
     - `ModelError` for functions and matrices of the wrong shape and tolerances out of reach;
     - `InitializationError` for an inconsistent start, or an index above 1;
-    - `SimulationError` if the integration fails, with the time and the worst unknowns by name.
+    - `SimulationError` if the integration fails; the text gives the time and the worst unknowns.
     """
     y0 = jax.tree.map(_inexact, y0)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
@@ -276,18 +277,19 @@ def consistent_start(
     term: DAETerm, y0: State, *, t0: Time = 0.0, args: Args | None = None, max_steps: int = 50,
     names: Sequence[str] | None = None, throw: bool | None = None,
 ) -> Any:  # fmt: skip
-    """A consistent start near y0: what occurs differentiated stays (M y does), the algebraic unknowns are solved for.
+    """A consistent start near y0. It keeps the differentiated unknowns (M y) and solves for the algebraic ones.
 
     **Arguments:**
 
     - `term`, `y0`, `t0`, `args`, `names`: as in `solve_dae`.
     - `max_steps`: bounds the iterations of Newton's method.
-    - `throw`: whether to raise if there is none; otherwise it is not-a-number, and so are its derivatives. None:
-        outside jit, grad and vmap. Inside, True puts a callback to the host into the program.
+    - `throw`: whether to raise an error if there is none. With False, the result and its derivatives are then
+        not-a-number. None: raise outside jit, grad and vmap only. Inside jit, True puts a callback to the host into the
+        program.
 
     **Raises:**
 
-    - `InitializationError` if Newton's method does not converge, with the unknowns that still move.
+    - `InitializationError` if Newton's method does not converge; the text names the unknowns that still change.
 
     Differentiable with respect to `args` and y0.
     """

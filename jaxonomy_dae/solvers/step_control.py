@@ -48,11 +48,10 @@ def tolerance_like(atol: Tolerance, y: State) -> Tolerance:
 class StepControl(diffrax.AbstractAdaptiveStepSizeController):
     """Step sizes from tolerances of the local error.
 
-    Differs from `diffrax.PIDController` in three points. The first step (`dt0=None`) comes from the slopes of the
-    equations themselves, in their own time scale. `RESULTS.dt_min_reached` ends an integration whose step size falls
-    below the spacing of floating-point numbers, or that has rejected 100 steps without a step of ordinary length
-    between them. A solver that is `steered`, as `BDF` is, chooses step sizes itself and may shorten the next step after
-    one it kept.
+    Differs from `diffrax.PIDController` in three points. The first step (`dt0=None`) follows from the slopes of the
+    equations, in their own time scale. `RESULTS.dt_min_reached` ends an integration whose step size falls below the
+    spacing of floating-point numbers, or that has rejected 100 steps without a step of ordinary length between them. A
+    `steered` solver, such as `BDF`, chooses step sizes itself and may shorten the next step after an accepted one.
 
     **Arguments:**
 

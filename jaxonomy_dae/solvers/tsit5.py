@@ -22,14 +22,13 @@ COMPUTED_AGAIN = 32
 class Tsit5(diffrax.Tsit5):
     """Tsitouras' 5(4) method (2011) for a state that is one array; differs from `diffrax.Tsit5` by rounding alone.
 
-    Diffrax loops over the stages and writes each slope into a buffer. Written out, the stages fuse: under `vmap` and in
-    forward mode a step of a small model takes about half of the time. A large field is compiled once if they are looped
-    over, not six times.
+    Diffrax loops over the stages and writes each slope into a buffer. Unrolled stages fuse: under `vmap` and in forward
+    mode, a step of a small model takes about half of the time. A loop compiles a large field once instead of six times.
 
     **Arguments:**
 
     - `looped`: whether to loop over the stages; None decides by the size of the field.
-    - `watch`: ends the run with `switching.STIFF` where stability limits the steps; None goes on.
+    - `watch`: ends the run with `switching.STIFF` if stability limits the steps; None continues.
     """
 
     looped: bool | None = eqx.field(static=True, default=None)

@@ -6,11 +6,11 @@ import math
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Certificate:
-    """The result of a check, to be printed.
+    """The printable result of a check.
 
-    - `claim`: what holds.
-    - `checked`: on what, and how often.
-    - `error`: the largest error found, and `allowed`, how large it may be.
+    - `claim`: the statement.
+    - `checked`: the checked cases and their number.
+    - `error`: the largest error; `allowed`: its limit.
     - `where`: the place of the largest error.
     - `notes`: further remarks.
     """
@@ -24,7 +24,7 @@ class Certificate:
 
     @property
     def holds(self) -> bool:
-        """True if the error is finite and within the allowed one."""
+        """True if the error is finite and not above the limit."""
         return math.isfinite(self.error) and self.error <= self.allowed
 
     def __repr__(self):

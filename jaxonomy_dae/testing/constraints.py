@@ -13,23 +13,24 @@ from .certificate import Certificate
 def assert_constraints(solution: Solution, rtol: float = 1e-6, atol: float = 1e-8) -> Certificate:
     """Asserts that the saved states satisfy all constraints of the model, the hidden ones included.
 
-    Residuals of constraints have all kinds of units, and say little by themselves. What is measured here is how far a
-    state would have to be moved to satisfy them: a Gauss–Newton step of least norm onto the hidden constraints, and of
-    unknowns of nonlinear blocks the step to their root (`AcausalSystem.project`). No variable may have to move by more
-    than `atol·nominal + rtol·size`, with its nominal value and the largest size that it has in the solution.
+    Residuals of constraints have different units and say little by themselves. Therefore the check measures the
+    distance of the state from the constraints: the Gauss–Newton step of least norm onto the hidden constraints, and for
+    unknowns of nonlinear blocks the step to their root (`AcausalSystem.project`). No variable may move by more than
+    `atol·nominal + rtol·size`, with its nominal value and its largest size in the solution.
 
     **Arguments:**
 
-    - `solution`: of a run that reached all its saved times.
+    - `solution`: a solution that reached all its saved times.
     - `rtol`, `atol`: relative to the variables' sizes, and to their nominal values.
 
     **Returns:**
 
-    A `Certificate`; its error counts in units of what is allowed.
+    A `Certificate`; its error is relative to the allowed distance.
 
     **Raises:**
 
-    - `AssertionError` with the variable that would have to move furthest, when, by how much, and the constraints.
+    - `AssertionError` with the variable that is furthest from the constraints, the time, the distance, and the
+        constraints.
     - `ModelError` for a batch, inside jit, and for rows that were not reached.
     """
     system = solution.system

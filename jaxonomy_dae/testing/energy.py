@@ -10,13 +10,13 @@ from .certificate import Certificate
 
 
 def assert_energy_balance(solution: Solution, rtol: float = 1e-4) -> Certificate:
-    """Asserts that what is stored changes by what is supplied and lost, as components declare them.
+    """Asserts that the stored energy changes by the supplied and lost energy, as components declare them.
 
     **Arguments:**
 
     - `solution`: of a model whose components declare energies and powers; those of `jaxonomy_dae.library` do.
-    - `rtol`: the largest error allowed at any saved time, relative to the largest of all that was stored, supplied or
-        lost on the way. The saved states carry the error of their own run. Allow a hundred times its tolerance.
+    - `rtol`: the largest allowed error at any saved time, relative to the largest energy that was stored, supplied or
+        lost. The saved states have the error of their own run: allow a hundred times its tolerance.
 
     **Returns:**
 

@@ -29,18 +29,19 @@ def assert_gradient(
     """Asserts that reverse-mode derivatives agree with forward-mode ones, and with central differences.
 
     Differences are extrapolated to step zero from a sequence of steps, which also estimates their error (Ridders 1982,
-    Advances in Engineering Software 4:75). Where this error is larger than what is to be told, the check fails too and
-    says so: nothing would have been checked.
+    Advances in Engineering Software 4:75). If this error is larger than the allowed deviation, the check fails, too,
+    and says so.
 
     **Arguments:**
 
-    - `f`: `f(at)` returns a number, or arrays (of which a random combination is taken). `simulate` inside is given the
-        adjoint that each mode needs, unless `f` itself gives one.
+    - `f`: `f(at)` returns a number, or arrays (of which a random combination is taken). A `simulate` inside gets the
+        adjoint that each mode needs, unless `f` gives one.
     - `at`: a pytree, such as an array, a dictionary of numbers, or what `system.partition` returns; its floating-point
         numbers are moved, each by its size.
-    - `rtol`: the largest deviation, relative to the largest derivative by what is moved, each in units of its size. A
-        run at `rtol=1e-6` has derivatives, and differences, good to some 1e-4.
-    - `directions`: with more than 16 numbers, so many random directions are looked at; else each number by itself.
+    - `rtol`: the largest deviation, relative to the largest derivative, each in units of the size of its number. At
+        `rtol=1e-6`, derivatives and differences of a run are accurate to about 1e-4.
+    - `directions`: the number of random directions that are checked if `at` has more than 16 numbers. Otherwise each
+        number is checked by itself.
 
     **Returns:**
 

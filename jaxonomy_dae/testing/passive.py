@@ -27,25 +27,24 @@ def assert_passive(
 ) -> Certificate:  # fmt: skip
     """Asserts that a law N brings no energy in: N(u)·v ≤ 0, where v is the first `size` of its inputs u.
 
-    Inputs are sampled over six decades around what is typical; from the worst of them N·v/|v|² is followed upwards by
-    quasi-Newton steps, so that a small region in which the law is active is found too if it can be climbed to. Of a
-    `PortHamiltonian`, dH/dt ≤ 0 is checked.
+    Inputs are sampled over six decades around their typical sizes. From the worst of them, quasi-Newton steps increase
+    N·v/|v|² further, to find small regions in which the law is active. For a `PortHamiltonian`, dH/dt ≤ 0 is checked.
 
     **Arguments:**
 
     - `law`: `law(u) -> (size,)`: one of `learning`'s passive laws, or any function that JAX can trace.
-    - `size`: how many inputs are efforts; a law of `AbstractPassive` knows.
-    - `inputs`: what inputs typically are, one number or one for each; laws of `learning` know theirs. Of other
-        functions, they also say how many inputs there are.
-    - `rtol`: which power is allowed, relative to Σ |N_i v_i|; default: a thousand units in the last place, what
-        rounding may make.
-    - `weights`: so many other sets of weights are drawn, from a tenth to ten times as large as they are: the promise
-        of a law that is passive by its structure must survive them.
-    - `count`: how many inputs are sampled for each set of weights.
+    - `size`: the number of inputs that are efforts; a law of `AbstractPassive` knows it.
+    - `inputs`: typical sizes of the inputs, one number or one for each; laws of `learning` know theirs. For other
+        functions, they also define the number of inputs.
+    - `rtol`: the allowed power, relative to Σ |N_i v_i|; default: a thousand units in the last place, a bound of
+        rounding errors.
+    - `weights`: the number of random sets of weights to check, too, from a tenth to ten times as large as the given
+        ones. A law that is passive by structure is passive with all of them.
+    - `count`: the number of inputs that are sampled for each set of weights.
 
     **Returns:**
 
-    A `Certificate`. Sampling proves nothing: what holds for all inputs is in the law's structure or it is not.
+    A `Certificate`. Sampling is not a proof: only the structure of a law can guarantee passivity for all inputs.
 
     **Raises:**
 
