@@ -59,7 +59,7 @@ class _CellData(NamedTuple):
     ocv: Any
     R: Sequence[Value]
     C: Sequence[Value]
-    initial_v: Sequence[Value] | None
+    initial_voltage: Sequence[Value] | None
     kind: str
 
     def checked(self, name: str) -> "_CellData":
@@ -68,12 +68,12 @@ class _CellData(NamedTuple):
         ocv, R, C = row(self.ocv, name, "ocv"), row(self.R, name, "R"), row(self.C, name, "C")
         if len(ocv) != len(points):
             raise ModelError(f"'{name}': ocv has {len(ocv)} entries, soc has {len(points)}: they must agree")
-        starts = None if self.initial_v is None else row(self.initial_v, name, "initial_v")
+        starts = None if self.initial_voltage is None else row(self.initial_voltage, name, "initial_voltage")
         voltages = len(R) if starts is None else len(starts)
         if not len(R) == len(C) == voltages:
             raise ModelError(
                 f"'{name}' needs a resistance, a capacity and, if given, a voltage for each RC pair; got {len(R)} in "
-                f"R, {len(C)} in C and {voltages} in initial_v"
+                f"R, {len(C)} in C and {voltages} in initial_voltage"
             )
         known_kind(self.kind, name)
         return _CellData(points, ocv, R, C, starts, self.kind)
@@ -97,7 +97,7 @@ class _Cell(TwoPin):
         for k, (resistance, capacity, start) in enumerate(zip(R, C, starts, strict=True), start=1):
             r = self.parameter(f"R{k}", resistance, unit="Ohm", bounds=POSITIVE)
             c = self.parameter(f"C{k}", capacity, unit="F", bounds=POSITIVE)
-            v0 = self.parameter(f"initial_v{k}", start, unit="V")
+            v0 = self.parameter(f"initial_voltage{k}", start, unit="V")
             v = self.variable(f"v{k}", start=v0, fixed=True, unit="V")
             self.add_equations(Eq(c * der(v), current - v / r))
             self.declare_energy(c * v**2 / 2)
@@ -135,8 +135,8 @@ class Cell(_Cell):
     - `R0` > 0: the series resistance (ohm).
     - `R`, `C`: the resistances (ohm) and capacities (farad) of the pairs, each > 0: the parameters `R1`, `C1`, …
     - `eta`: the coulombic efficiency, 0 < eta ≤ 1.
-    - `initial_soc`: the state of charge at the start. `initial_v`: the pairs' voltages at the start; all zero, as in a
-        cell that has rested, if left out.
+    - `initial_soc`: the state of charge at the start. `initial_voltage`: the voltages of the pairs at the start;
+        default: zero, as in a cell at rest.
     - `kind`: of the interpolation, 'linear' or 'cubic', as in `signal.Table1D`.
 
     **Raises:**
@@ -156,12 +156,12 @@ class Cell(_Cell):
         C: Sequence[Value] = (),
         eta: Value = 1.0,
         initial_soc: Value = 1.0,
-        initial_v: Sequence[Value] | None = None,
+        initial_voltage: Sequence[Value] | None = None,
         kind: str = "linear",
     ):
         super().__init__(ev, name)
         resistance = self.parameter("R0", R0, unit="Ohm", bounds=POSITIVE)
-        c = self._circuit(_CellData(soc, ocv, R, C, initial_v, kind), Q, eta, initial_soc)
+        c = self._circuit(_CellData(soc, ocv, R, C, initial_voltage, kind), Q, eta, initial_soc)
         voltage = self.output("ocv", c.table, unit="V")
         self.add_equations(Eq(c.voltage, voltage + resistance * c.current + c.overpotentials))
         self.declare_energy(c.table_energy)
@@ -204,7 +204,7 @@ class HeatedCell(_Cell):
         C: Sequence[Value] = (),
         eta: Value = 1.0,
         initial_soc: Value = 1.0,
-        initial_v: Sequence[Value] | None = None,
+        initial_voltage: Sequence[Value] | None = None,
         kind: str = "linear",
         Ea: Value = 0.0,
         dUdT: Value = 0.0,
@@ -216,7 +216,7 @@ class HeatedCell(_Cell):
         entropy = self.parameter("dUdT", dUdT, unit="V/K")
         reference = self.parameter("T_ref", T_ref, unit="K", bounds=POSITIVE)
         heat = self.port("heat", Thermal)
-        c = self._circuit(_CellData(soc, ocv, R, C, initial_v, kind), Q, eta, initial_soc)
+        c = self._circuit(_CellData(soc, ocv, R, C, initial_voltage, kind), Q, eta, initial_soc)
         voltage = self.output("ocv", c.table + entropy * (heat.T - reference), unit="V")
         gas = self.parameter("gas_constant", GAS_CONSTANT, unit="J/(mol*K)", bounds=POSITIVE)
         r = self.output("r", resistance * exp(activation / gas * (1 / heat.T - 1 / reference)), unit="Ohm")
@@ -269,7 +269,7 @@ class _Pack(Component):
         self, kind: type[Component], shape: tuple[int, int], given: _CellData, values: dict[str, Any]
     ) -> ComponentArray:
         """Adds the cells and connects them; returns them, an array of the given shape."""
-        points, ocv, R, C, initial_v, table = given.checked(self.name)
+        points, ocv, R, C, initial_voltage, table = given.checked(self.name)
         p, n = self.port("p", Electrical), self.port("n", Electrical)
         volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
 
@@ -279,8 +279,8 @@ class _Pack(Component):
             return [self._each(f"{what}{k}", value, shape, unit, bounds) for k, value in enumerate(given, start=1)]
 
         options = {"R": of_pairs("R", R, "Ohm", POSITIVE), "C": of_pairs("C", C, "F", POSITIVE)}
-        if initial_v is not None:
-            options["initial_v"] = of_pairs("initial_v", initial_v, "V", Interval())
+        if initial_voltage is not None:
+            options["initial_voltage"] = of_pairs("initial_voltage", initial_voltage, "V", Interval())
         options |= self._values(shape, values)
         cells = self.add_array("cell", kind, shape, points.tolist(), volts, kind=table, **options)
         self.connect(p, cells[0].p)
@@ -299,8 +299,8 @@ class Pack(_Pack):
 
     - `series`, `parallel`: how many, each ≥ 1.
     - All other arguments are those of `Cell`. `Q`, `R0`, `eta`, `initial_soc` and the entries of `R`, `C` and
-        `initial_v` are one value for all cells, a parameter of the pack, or an array of shape (series, parallel), whose
-        entries are parameters of the cells.
+        `initial_voltage` are one value for all cells, a parameter of the pack, or an array of shape (series, parallel)
+        with the parameters of the cells.
 
     **Raises:**
 
@@ -321,12 +321,12 @@ class Pack(_Pack):
         C: Sequence[Any] = (),
         eta: Value | np.ndarray = 1.0,
         initial_soc: Value | np.ndarray = 1.0,
-        initial_v: Sequence[Any] | None = None,
+        initial_voltage: Sequence[Any] | None = None,
         kind: str = "linear",
     ):
         super().__init__(ev, name)
         values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc}
-        self._cells(Cell, _shape(name, series, parallel), _CellData(soc, ocv, R, C, initial_v, kind), values)
+        self._cells(Cell, _shape(name, series, parallel), _CellData(soc, ocv, R, C, initial_voltage, kind), values)
 
 
 class HeatedPack(_Pack):
@@ -364,7 +364,7 @@ class HeatedPack(_Pack):
         C: Sequence[Any] = (),
         eta: Value | np.ndarray = 1.0,
         initial_soc: Value | np.ndarray = 1.0,
-        initial_v: Sequence[Any] | None = None,
+        initial_voltage: Sequence[Any] | None = None,
         kind: str = "linear",
         Ea: Value | np.ndarray = 0.0,
         dUdT: Value | np.ndarray = 0.0,
@@ -377,7 +377,7 @@ class HeatedPack(_Pack):
         super().__init__(ev, name)
         shape = _shape(name, series, parallel)
         values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc, "Ea": Ea, "dUdT": dUdT, "T_ref": T_ref}
-        cells = self._cells(HeatedCell, shape, _CellData(soc, ocv, R, C, initial_v, kind), values)
+        cells = self._cells(HeatedCell, shape, _CellData(soc, ocv, R, C, initial_voltage, kind), values)
         thermal = {"C_heat": C_heat, "G_coolant": G_coolant, "initial_temperature": initial_temperature}
         each = self._values(shape, thermal)
         between = self.parameter("G_neighbour", G_neighbour, unit="W/K", bounds=NONNEGATIVE)

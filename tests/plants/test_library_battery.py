@@ -42,8 +42,8 @@ def cells():
     ev = EqnEnv()
     parts = {
         "full": Cell(ev, "full", SOC, OCV, 2.0, 0.03, **PAIRS, initial_soc=0.95),
-        "empty": Cell(ev, "empty", SOC, OCV, 2.0, 0.03, **PAIRS, eta=0.98, initial_soc=0.1, initial_v=[0.01, 0.02],
-                      kind="cubic"),
+        "empty": Cell(ev, "empty", SOC, OCV, 2.0, 0.03, **PAIRS, eta=0.98, initial_soc=0.1,
+                      initial_voltage=[0.01, 0.02], kind="cubic"),
         "bare": Cell(ev, "bare", SOC, OCV, 1.5, 0.05, initial_soc=0.5),
     }  # fmt: skip
     ground = el.Ground(ev, "ground")

@@ -33,12 +33,15 @@ class FirstOrder(Component):
 
 
 class SecondOrder(Component):
-    """y''/w² + 2·D·y'/w + y = k·u, `w` > 0 in rad/s, `D` the damping ratio, from rest at `initial_y`."""
+    """y''/w² + 2·zeta·y'/w + y = k·u, `w` > 0 in rad/s, with the damping ratio `zeta`, from rest at `initial_y`."""
 
-    def __init__(self, ev: EqnEnv, name: str, k: Value = 1.0, w: Value = 1.0, D: Value = 1.0, initial_y: Value = 0.0):
+    def __init__(
+        self, ev: EqnEnv, name: str, k: Value = 1.0, w: Value = 1.0, zeta: Value = 1.0, initial_y: Value = 0.0
+    ):
         super().__init__(ev, name)
         gain, y0 = self.parameter("k", k), self.parameter("initial_y", initial_y)
-        frequency, damping = self.parameter("w", w, unit="rad/s", bounds=POSITIVE), self.parameter("D", D, unit="1")
+        frequency = self.parameter("w", w, unit="rad/s", bounds=POSITIVE)
+        damping = self.parameter("zeta", zeta, unit="1")
         u, y = self.input("u"), self.variable("y", start=y0, fixed=True)
         v = self.variable("v", start=0.0, fixed=True)
         self.add_equations(Eq(der(y), v), Eq(der(v), frequency * (frequency * (gain * u - y) - 2 * damping * v)))
