@@ -263,9 +263,6 @@ CLASSES = (  # of reasons: what an error says, and what that means
 EXPLAINED = {
     "Electrical.Analog.Examples.OpAmps.SignalGenerator": "three starts satisfy its equations; the run begins at the "
     "unstable one, where the oscillator rests",
-    "Mechanics.Rotational.Examples.LossyGearDemo1": "torques and modes form one nonlinear block, whose conditions are "
-    "no events; `system.report` says so in a note",
-    "Mechanics.Rotational.Examples.LossyGearDemo2": "as LossyGearDemo1",
 }
 HEAD = """# The Modelica library
 
