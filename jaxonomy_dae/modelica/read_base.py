@@ -48,7 +48,8 @@ _LEVEL = {  # binary operators, and how strongly they bind
 }  # fmt: skip
 _NOT, _SUM, _POWER = 3, 5, 7
 INSIDE = "[\\'"  # a quoted name with names in its subscripts
-_PART = re.compile(r"([^\[\]]+)(?:\[((?:'(?:[^'\\]|\\.)*'|[^\]'])*)\])?\.?")
+_QUOTED = r"'(?:[^'\\]|\\.)*'"
+_PART = re.compile(rf"([^\[\]]+)(?:\[((?:{_QUOTED}|\[(?:{_QUOTED}|[^\[\]'])*\]|[^\[\]'])*)\])?\.?")
 _PREFIXES = frozenset(
     "parameter constant discrete input output final flow stream inner outer each protected public".split()
 )

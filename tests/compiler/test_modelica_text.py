@@ -275,8 +275,9 @@ def test_quoted_names_with_subscripts_inside():
       model m
         constant Integer 't[\'L\'.\'\\\'U\\\'\']' = 5;
         constant Integer 't[\'L\'.\'one\']' = 7;
-        Real 'x[1].y'; Real 'x[2].y'; Real 'z';
+        Real 'x[1].y'; Real 'x[2].y'; Real 'z'; Real 'w';
       equation
+        'w' = sum('x[(1:2)[\'$k\']].y' for '$k' in 1:2);
         'z' = 't[1]' + 't[2]' + time;
       algorithm
         for 'i' in 1:2 loop 'x[\'i\'].y' := 'i' * time; end for;
@@ -284,8 +285,8 @@ def test_quoted_names_with_subscripts_inside():
     end p;"""
     component = built(text)
     time = component.ev.t
-    x1, x2, z = map(VariableSymbol, ("x[1].y", "x[2].y", "z"))
-    assert {e.subs({x1: time, x2: 2 * time, z: 12 + time}) for e in component.equations} == {0}
+    x1, x2, z, w = map(VariableSymbol, ("x[1].y", "x[2].y", "z", "w"))
+    assert {e.subs({x1: time, x2: 2 * time, z: 12 + time, w: 3 * time}) for e in component.equations} == {0}
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
