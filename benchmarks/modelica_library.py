@@ -246,7 +246,7 @@ CLASSES = (  # of reasons: what an error says, and what that means
     ("no parameter and no start", "agrees, but has nothing to differentiate by: the text has numbers for parameters"),
     ("the gradient is off", "the gradient is not that of differences"),
     ("deviates", "deviates from the reference"),
-    ("written in C", "calls a function in C, such as a random generator or the reader of a file"),
+    ("written in C", "calls a function in C, such as the reader of a file, or draws from a global random generator"),
     ("expected a class|unknown character", "the text is empty or broken"),
     ("the function .* is not known", "calls a function whose definition the text does not hold"),
     ("delay", "needs `delay`"),
