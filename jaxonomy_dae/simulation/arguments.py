@@ -17,6 +17,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
+from ..adjoint.resting import still
 from ..aliases import Inputs, Result, Time
 from ..errors import ModelError
 from ..initialization.initial_values import check_initial
@@ -120,7 +121,9 @@ def _told(value: object) -> str:
 def _check_periods(system: AcausalSystem):
     if system.plan.events is None or not system.plan.events.n_clocks:
         return
-    periods = _concrete(SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes).clocks()[0])
+    # Under `jax.grad` alone, too, their values are known, and nothing is compiled to look at them.
+    known = eqx.tree_at(lambda s: s.parameters, system, still(system.parameters))
+    periods = _concrete(SystemAt(system.plan, known.numbers, (), 0.0, {}, system.typical_sizes).clocks()[0])
     if periods is None:
         return
     bad = np.flatnonzero(~(periods > 0))

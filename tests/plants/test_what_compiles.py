@@ -136,14 +136,16 @@ def test_a_first_call_is_few_programs():
 
 
 class Driven(Component):
-    """x' = k (sin(ωt) − x), counted whenever x rises through a level."""
+    """x' = k (sin(ωt) − x), counted by a clock and whenever x rises through a level."""
 
     def __init__(self, ev, name):
         super().__init__(ev, name)
         k, w, level = self.parameter("k", 1.0), self.parameter("w", 4.0), self.parameter("level", 0.1)
         x, n = self.variable("x", start=0.0, fixed=True), self.discrete("n", 0.0)
+        m = self.discrete("m", 0.0)
         self.add_equations(Eq(der(x), k * (sin(w * ev.t) - x)))
         self.when(x > level, assign(n, pre(n) + 1))
+        self.when(self.sampled(0.7), assign(m, pre(m) + 1))
 
 
 def test_a_gradient_is_few_programs():
