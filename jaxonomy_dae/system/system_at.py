@@ -4,6 +4,8 @@ All functions take the static plan, the flat parameters, the networks, time, the
 systems are traced on scalars, which XLA fuses into a few kernels; large ones on arrays.
 """
 
+import functools
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -54,7 +56,9 @@ class SystemAt:
         return Evaluation(self._chunk(x), inputs, self.parameters, t, networks, self.typical).run(program, refine)
 
     def _chunk(self, x: Any) -> Any:
-        """The state as a tuple of scalars, if it has up to `SCALARS` entries; else as an array."""
+        """The state as a tuple of scalars, if it is one or has up to `SCALARS` entries; else as an array."""
+        if isinstance(x, tuple):
+            return x
         if self._last is None or self._last[0] is not x:
             array = jnp.asarray(x)
             if jnp.shape(array) != (self.plan.n_state,):
@@ -275,12 +279,12 @@ class SystemAt:
     def _least_norm_step(self, x: Any) -> Any:
         plan = self.plan
         n = len(plan.states)
-        unit = plan.nominal[:n]
-        nominal = 1.0 if (unit == 1.0).all() else jnp.asarray(unit, self.dtype)
-        value, pull = jax.vjp(lambda states: self.projected_onto(jnp.concatenate([states, x[n:]])), x[:n])
-        jacobian = times(nominal, jax.vmap(lambda e: pull(e)[0])(np.eye(len(value), dtype=self.dtype)))
-        # Each constraint in units of its gradient: multiplied by 1e9 it is projected onto alike, and squares of single
-        # precision do not underflow.
+        if plan.n_state <= SCALARS and plan.n_constraints <= UNROLLED and plan.held is None:
+            return self._least_norm_of_few(self._chunk(x))
+        nominal = jnp.asarray(plan.nominal[:n], self.dtype)
+        value, pull = jax.vjp(self.projected_onto, x)
+        jacobian = jax.vmap(lambda e: pull(e)[0])(np.eye(len(value), dtype=self.dtype))[:, :n] * nominal
+        # Each constraint in units of its gradient: multiplied by 1e9 it is projected onto alike.
         size = jnp.max(jnp.abs(jax.lax.stop_gradient(jacobian)), axis=1, initial=0.0)
         absent = None
         if plan.held is not None:  # a row that asks for nothing is zero, and is left out
@@ -289,15 +293,38 @@ class SystemAt:
             size = size + absent
         jacobian, value = jacobian / size[:, None], value / size
         gram = jacobian @ jacobian.T
-        gram = gram if absent is None else gram + jnp.diag(absent)
-        m = len(value)
-        if m <= UNROLLED:
-            flat = entries(gram.ravel())
-            multiplier = jnp.stack(solve([flat[k * m : (k + 1) * m] for k in range(m)], entries(value), positive=True))
-        else:
-            multiplier = jnp.linalg.solve(gram, value)
-        moved = x[:n] - times(nominal, multiplier @ jacobian)
-        return jnp.concatenate([moved, x[n:]]) if len(plan.carried) else moved
+        multiplier = jnp.linalg.solve(gram if absent is None else gram + jnp.diag(absent), value)
+        return jnp.concatenate([x[:n] - nominal * (multiplier @ jacobian), x[n:]])
+
+    def _least_norm_of_few(self, state: tuple) -> Any:
+        """As `_least_norm_step` on scalars, which XLA fuses: products of small matrices take a pendulum three times as
+        long, alone and in batches."""
+        plan = self.plan
+        n = len(plan.states)
+        nominal, rest = plan.nominal[:n], state[n:]
+
+        def residuals(*x):
+            found = self._constraints((*x, *rest))
+            return [v[k] if jnp.ndim(v) else v for v in found for k in range(max(1, v.size))]
+
+        value, pull = jax.vjp(residuals, *state[:n])
+        one, zero, m = jnp.ones((), self.dtype), jnp.zeros((), self.dtype), len(value)
+        rows = [pull([one if j == k else zero for j in range(m)]) for k in range(m)]
+        # In units of the states, and each constraint beside the largest unit in it: squares of single precision
+        # underflow at 1e-19. In a definite matrix other scales do not matter.
+        pattern = plan.constraint_pattern or (frozenset(range(n)),) * m
+        largest = [max((nominal[c] for c in inside), default=1.0) for inside in pattern]
+        rows = [[times(nominal[c] / s, v) for c, v in enumerate(row)] for s, row in zip(largest, rows, strict=True)]
+        gram = [
+            [_sum([rows[a][c] * rows[b][c] for c in sorted(pattern[a] & pattern[b])], zero) for b in range(m)]
+            for a in range(m)
+        ]
+        multiplier = solve(gram, [times(1 / s, v) for s, v in zip(largest, value, strict=True)], positive=True)
+        moved = list(state)
+        for c in range(n):
+            terms = [rows[a][c] * multiplier[a] for a in range(m) if c in pattern[a]]
+            moved[c] = moved[c] - times(nominal[c], _sum(terms, zero))
+        return jnp.stack(moved)
 
     # --- events ------------------------------------------------------------------------------------------------
 
@@ -370,3 +397,7 @@ class SystemAt:
         """The values of quantities with factors, shape (len(quantity),)."""
         program = self.plan.reading(quantity)
         return self._filled(self.run(program, x, Refinement.ROOT), program.layout.gather(quantity, factor))
+
+
+def _sum(terms: list[Any], zero: Any) -> Any:
+    return functools.reduce(operator.add, terms) if terms else zero
