@@ -15,7 +15,7 @@ from ..errors import ModelError, nearest
 from ..modeling.symbols import VariableSymbol, der
 from .builtin import FUNCTIONS, filled, matrix_product
 from .flat_model import literal_numbers
-from .operations import ARITHMETIC, RELATIONS, of_complex_numbers
+from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
 from .tree import (
     Array,
     Assignment,
@@ -190,7 +190,7 @@ class Interpreter:
             return entrywise(both if sign == "and" else either, a, self.evaluate(e.right, names))
         a, b = self.evaluate(e.left, names), self.evaluate(e.right, names)
         if sign in RELATIONS:
-            return RELATIONS[sign](self._compared(a), self._compared(b))
+            return RELATIONS[sign](a, b) if sign in ("==", "<>") else RELATIONS[sign](*map(self._compared, (a, b)))
         if sign == "*" and isinstance(a, list) and isinstance(b, list):
             return matrix_product(a, b)
         if sign == "+" and isinstance(a, str):
@@ -204,7 +204,8 @@ class Interpreter:
         branches, and compare these as sets."""
         if self.guarded or not isinstance(value, sympy.Expr) or not value.has(sympy.Piecewise):
             return value
-        return self.named(value) if value.atoms(VariableSymbol) else value
+        stays = isinstance(value, sympy.Piecewise) and not moves(value)
+        return self.named(value) if value.atoms(VariableSymbol) and not stays else value
 
     def _choice(self, e: Choice, names: Names) -> Value:
         pairs = []

@@ -35,17 +35,20 @@ def _relation(number: Callable[[Any, Any], bool], symbol: Any) -> Callable[[Valu
         if isinstance(a, int | float | str) and isinstance(b, int | float | str):
             return number(a, b)
         for choice, on_left in ((a, True), (b, False)):
-            if isinstance(choice, sympy.Piecewise) and not _moves(choice):
+            if isinstance(choice, sympy.Piecewise) and not moves(choice):
                 return _of_branches(choice, lambda v: relation(v, b) if on_left else relation(a, v))  # noqa: B023
         return plain(symbol(a, b))
 
     return relation
 
 
-def _moves(choice: sympy.Piecewise) -> bool:
+def moves(choice: sympy.Piecewise) -> bool:
     """True if a branch changes between events."""
     branches: tuple[Any, ...] = choice.args
-    return any(isinstance(s, VariableSymbol) for value, _ in branches for s in value.free_symbols)
+    return any(
+        moves(value) if isinstance(value, sympy.Piecewise) else bool(value.atoms(VariableSymbol))
+        for value, _ in branches
+    )
 
 
 def _of_branches(choice: sympy.Piecewise, holds: Callable[[Value], Value]) -> Value:

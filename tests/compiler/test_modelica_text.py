@@ -442,6 +442,10 @@ def test_a_relation_with_a_choice_in_it():
       y = if time < (if time < 1.0 then 0.5 else 2.0) then 1.0 else 2.0; end m;"""
     component = built(text)
     assert ":value[0]" in component.variables and ":value[1]" not in component.variables
+    text = """model m Real u; Integer k; Integer n(start = 0); Real x; equation u = sin(time); x = n + k;
+      k = if u > 0.5 then 1 else if u < -0.5 then -1 else 0;
+      when k <> 0 then n = pre(n) + 1; elsewhen k > 0 then n = pre(n) + 2; end when; end m;"""
+    assert not any(name.startswith(":value") for name in built(text).variables)
 
 
 def test_at_a_tick_pre_is_the_value_before_it():
