@@ -52,6 +52,7 @@ LEVELS: dict[str, tuple[Entry, ...]] = {
     "Engineering studies": (
         Entry("battery_pack", "Arrays of cells with heat; which cell is bad?", "40 seconds"),
         Entry("house", "Identify, control and design a house by one model."),
+        Entry("modelica", "Models read from Modelica: gradients, a fit, a thousand runs.", "40 seconds"),
         Entry("next_experiment", "Which experiment tells most, before it is made.", "30 seconds"),
     ),
     "Measured data": (

@@ -648,3 +648,34 @@ def test_measured_house():
     assert fit.log_likelihood > runs.log_likelihood + 100
     assert "house.Rie" in names["apart"] and names["rms"]["on"] > 1.5 * names["rms"]["off"]
     assert abs(fit.whiteness["house"]["house.Ti"].correlation) < 0.5 < runs.whiteness["house"]["house.Ti"].correlation
+
+
+def test_modelica():
+    """The slope of the rectifier's mean voltage against differences; heat and slip of the clutch against SciPy's
+    integration of each of its phases."""
+    names = names_after("modelica")
+    assert abs(names["slope"] / names["difference"] - 1) < 1e-4
+    assert abs(names["fit"].values["clutch.mu"] - 0.27) < 0.002  # five standard deviations
+
+    def closed(mu):
+        def field(t, s):
+            torque = mu * 0.1 * min(300.0 * t, 300.0)
+            return [(2 * t - torque) / 0.2, torque / 0.5, torque * (s[0] - s[1])]
+
+        def met(t, s):
+            return s[0] - s[1]
+
+        met.terminal, met.direction = True, -1
+        first = solve_ivp(field, (0.0, 8.0), [60.0, 0.0, 0.0], events=met, rtol=1e-10, atol=1e-10, max_step=0.1)
+        slips = mu * 30.0 * 0.7 / (0.5 * 2.0)  # sticking = sliding
+        heat, slip = first.y[2, -1], first.y[0, -1] - first.y[1, -1]
+        begins = max(first.t[-1], slips)
+        if first.t[-1] < 8.0 and begins < 8.0:
+            last = solve_ivp(field, (begins, 8.0), [0.0, 0.0, 0.0], rtol=1e-10, atol=1e-10, max_step=0.1).y[:, -1]
+            heat, slip = heat + last[2], last[0] - last[1]
+        return heat, slip
+
+    for k in (0, 139, 141, 143, 293, 333, 700, 999):
+        heat, slip = closed(float(names["coefficients"][k]))
+        np.testing.assert_allclose(names["heat"][k], heat, rtol=1e-4)
+        np.testing.assert_allclose(names["slip"][k], slip, rtol=1e-4, atol=1e-6)
