@@ -148,7 +148,7 @@ def _names(names: tuple[str, ...]) -> str:
     return ", ".join(names[:SHOWN]) + (f", … ({len(names)})" if len(names) > SHOWN else "")
 
 
-def _entries(matrix: np.ndarray) -> list[list[str]]:
+def _entries(matrix: Any) -> list[list[str]]:
     """The first rows and columns, as text; an ellipsis stands for the others."""
     rows = [[f"{v:.5g}" for v in row[:SHOWN]] + ["…"] * (len(row) > SHOWN) for row in np.asarray(matrix)[:SHOWN]]
     return rows + [["…"]] * (len(matrix) > SHOWN)

@@ -349,7 +349,7 @@ def test_a_model_of_zeros_is_observed():
 def test_quantities_are_read_in_blocks_of_times(monkeypatch):
     """Kind: what is read costs what was not asked for. One algebraic variable of a large model was all quantities at
     all times: 0.8 GB for 8 kB. Blocks give the same numbers, the last one shorter too."""
-    from jaxonomy_dae.programs import blocks
+    from jaxonomy_dae.programs import rows
 
     def write(self, ev):
         x, y, z = self.variable("x", start=1.0, fixed=True), self.variable("y"), self.variable("z")
@@ -357,8 +357,8 @@ def test_quantities_are_read_in_blocks_of_times(monkeypatch):
 
     ts = np.linspace(0.0, 1.0, 11)
     solution = simulate(compiled(component(write)), 1.0, ts=ts, rtol=1e-9, atol=1e-11)
-    monkeypatch.setattr(blocks, "ROOM", 4 * 4)  # times
-    text = str(jax.make_jaxpr(lambda x: blocks.at_times(lambda a: a + 1, x, width=4))(jnp.ones(11)))
+    monkeypatch.setattr(rows, "ROOM", 4 * 4)  # times
+    text = str(jax.make_jaxpr(lambda x: rows.at_times(lambda a: a + 1, x, width=4))(jnp.ones(11)))
     assert "scan" in text
     x = np.exp(-ts)
     np.testing.assert_allclose(solution["c.y"], x**2 + ts, rtol=1e-7)
