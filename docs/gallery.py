@@ -44,21 +44,21 @@ LEVELS: dict[str, tuple[Entry, ...]] = {
     ),
     "Learning laws": (
         Entry("clogged_filter", "A network in an algebraic equation.", "50 seconds"),
-        Entry("slider_crank", "A coefficient that multiplies a constraint force nobody measured."),
-        Entry("bounce", "Gradients through jumps, and a policy trained through them.", "80 seconds"),
+        Entry("slider_crank", "A coefficient that multiplies a constraint force nobody measured.", "40 seconds"),
+        Entry("bounce", "Gradients through jumps, and a policy trained through them.", "100 seconds"),
         Entry("sticking_friction", "A friction law with modes: stick and slip.", "40 seconds"),
-        Entry("positioning", "A sampled neural controller trained through friction that sticks."),
+        Entry("positioning", "A sampled neural controller trained through friction that sticks.", "50 seconds"),
     ),
     "Engineering studies": (
         Entry("battery_pack", "Arrays of cells with heat; which cell is bad?", "40 seconds"),
-        Entry("house", "Identify, control and design a house by one model."),
+        Entry("house", "Identify, control and design a house by one model.", "60 seconds"),
         Entry("modelica", "Models read from Modelica: gradients, a fit, a thousand runs.", "40 seconds"),
         Entry("next_experiment", "Which experiment tells most, before it is made.", "30 seconds"),
     ),
     "Measured data": (
         Entry("battery_pulses", "A cell's equivalent circuit from measured pulses.", "40 seconds"),
-        Entry("overflowing_tanks", "Physics and a learned correction on a public benchmark."),
-        Entry("measured_house", "Equations with errors: a Kalman filter inside the fit."),
+        Entry("overflowing_tanks", "Physics and a learned correction on a public benchmark.", "50 seconds"),
+        Entry("measured_house", "Equations with errors: a Kalman filter inside the fit.", "30 seconds"),
     ),
 }
 DOWNLOADS = {"battery_pulses", "overflowing_tanks", "measured_house"}

@@ -25,8 +25,8 @@ class HardStop(AlongLine, Compliant):
     **Arguments:**
 
     - `length`: metre. `restitution`: from 0 to 1. `rest_speed` ≥ 0: metre per second.
-    - `touching`: whether they touch at the initial time, where s_rel = length and der(s_rel) = 0 must hold then.
-    - `clearance` > 0: by how much the flanges may overlap just after f has let go (metre).
+    - `touching`: whether they touch at the initial time. Then s_rel = length and der(s_rel) = 0 must hold there.
+    - `clearance` > 0: the allowed overlap of the flanges just after f has become zero (metre).
     """
 
     def __init__(
@@ -59,9 +59,9 @@ class Rope(AlongLine, Compliant):
 
     **Arguments:**
 
-    - `length`: metre. `taut`: whether it is at the initial time, where s_rel = length and der(s_rel) = 0 must hold
-        then.
-    - `clearance` > 0: by how much it may be overstretched just after it has become slack (metre).
+    - `length`: metre. `taut`: whether it is taut at the initial time. Then s_rel = length and der(s_rel) = 0 must hold
+        there.
+    - `clearance` > 0: the allowed overstretch just after it has become slack (metre).
     """
 
     def __init__(

@@ -158,7 +158,8 @@ class AcausalSystem(eqx.Module):
 
         **Arguments:**
 
-        - `names`: of parameters, of arrays of parameters, and of networks. Weights of networks are not transformed.
+        - `names`: names of parameters, of arrays of parameters, and of networks. Weights of networks are not
+            transformed.
 
         **Returns:**
 
@@ -259,8 +260,8 @@ class AcausalSystem(eqx.Module):
 
     @property
     def numbers(self) -> Float[Array, " m"]:
-        """The parameter values that equations read, shape (m,): all that were declared, then the hidden discrete
-        variables, then all discrete variables as before an event."""
+        """The numbers that equations read, shape (m,): declared parameters, hidden discrete variables, and the values
+        of all discrete variables before an event."""
         array = self.parameters.array
         events = self.plan.events
         if events is None or not len(events.discrete):

@@ -62,8 +62,8 @@ class String(TwoFrames):
     **Arguments:**
 
     - `length` > 0: metre.
-    - `taut`: whether it is at the initial time, where s = length and ds/dt = 0 must hold then.
-    - `clearance` > 0: by how much it may be overstretched just after it has become slack (metre).
+    - `taut`: whether it is taut at the initial time. Then s = length and ds/dt = 0 must hold there.
+    - `clearance` > 0: the allowed overstretch just after it has become slack (metre).
     """
 
     def __init__(
