@@ -202,7 +202,9 @@ def _gradient(system, names: list[str], fixed: list[str], begin: float, end: flo
     """The relative error of the derivatives of the sum of squares of the signals at the end, by up to two parameters or
     fixed starts: reverse mode against central differences. None if there is none of these."""
     values = system.parameters
-    by = [n for n in values.names if float(values[n]) and not n.startswith("m.:")][:2]
+    computed = {int(k) for group in values.table.dependents for k in group.target}
+    settable = [n for k, n in enumerate(values.names) if k not in computed and not n.startswith("m.:")]
+    by = [n for n in settable if float(values[n])][:2]
     starts = fixed[: 2 - len(by)]
     if not (by or starts) or not names:
         return None

@@ -1,4 +1,4 @@
-"""Runs a Base Modelica file: `python -m jaxonomy_dae.modelica model.bmo --csv out.csv --plot out.svg body.x body.v`."""
+"""Runs a Modelica model: `python -m jaxonomy_dae.modelica model.bmo --csv out.csv --plot out.svg body.x body.v`."""
 
 import argparse
 import csv
@@ -30,29 +30,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = _parser().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
     try:
-        flat = load(Path(asked.file))
+        flat = load(Path(asked.file), asked.model, asked.root)
         system = _compiled(flat, asked.names)
         if asked.report:
             print(system.report)
         solution = _run(flat, system, asked.stop_time, asked.tolerance)
+        names = [f"{flat.name}.{name}" for name in asked.names] or list(system.states)
+        ends = {name: float(solution[name][-1]) for name in names}
+        if asked.csv:
+            _write_csv(Path(asked.csv), solution, names, flat.name)
+        if asked.plot:
+            np.ravel(solution.plot(*names))[0].figure.savefig(asked.plot)
     except (JaxonomyDaeError, OSError) as error:
         print(f"{asked.file}: {error}", file=sys.stderr)
         return 1
-    names = [f"{flat.name}.{name}" for name in asked.names] or list(system.states)
-    if asked.csv:
-        _write_csv(Path(asked.csv), solution, names, flat.name)
-    if asked.plot:
-        np.ravel(solution.plot(*names))[0].figure.savefig(asked.plot)
     print(f"{flat.name}: {len(system.states)} states, t = {float(solution.ts[-1]):g} s")
-    for name in names[:20]:
-        print(f"  {name.removeprefix(flat.name + '.')} = {float(solution[name][-1]):.10g}")
+    for name, value in list(ends.items())[:20]:
+        print(f"  {name.removeprefix(flat.name + '.')} = {value:.10g}")
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m jaxonomy_dae.modelica", description="Runs a Base Modelica file.")
-    parser.add_argument("file", help="the text of a flat model, as OpenModelica writes it with --baseModelica")
+    parser = argparse.ArgumentParser(prog="python -m jaxonomy_dae.modelica", description="Runs a Modelica model.")
+    parser.add_argument(
+        "file",
+        help="a flat model, as OpenModelica writes it with --baseModelica, or Modelica source",
+    )
     parser.add_argument("names", nargs="*", help="variables to print, write and plot; the states if left out")
+    parser.add_argument("--model", help="the model of Modelica source to run, such as Package.Model")
+    parser.add_argument("--root", action="append", default=[], help="a library's folder, for source; may be repeated")
     parser.add_argument("--stop-time", type=float, help="end of the run (second); the text's own if left out")
     parser.add_argument("--tolerance", type=float, help="relative tolerance; the text's own if left out")
     parser.add_argument("--csv", help="a file for the trajectories")

@@ -150,3 +150,10 @@ def test_the_command_says_why_a_file_cannot_be_run(tmp_path, capsys):
     file.write_text("model m\n Real x; equation x = y; end m;")
     assert main([str(file)]) == 1
     assert "m, line 2: 'y' is not declared" in capsys.readouterr().err
+
+
+def test_the_command_says_which_variable_it_does_not_know(tmp_path, capsys):
+    file = tmp_path / "decay.bmo"
+    file.write_text("model m\n Real x(start = 1, fixed = true); equation der(x) = -x; end m;")
+    assert main([str(file), "y"]) == 1
+    assert "'m.y'" in capsys.readouterr().err
