@@ -74,7 +74,7 @@ def test_precisions_are_those_of_greatest_evidence():
     data = (np.sin(2 * x) + 0.05 * rng.standard_normal(40)) / 0.05
     bends = bends_of(Polynomial(jnp.zeros(count)), np.linspace(-1, 1, 15)[:, None], np.ones(1))
     everything, z = np.ones(count, bool), np.zeros(count)
-    evidence = Evidence(np.full(40, -1), (), np.zeros(0), (everything,), (everything,))
+    evidence = Evidence(np.full(40, -1), (), np.zeros(0), (everything,), laws=(everything,))
     weights = Weights(np.ones(40), np.ones(count), np.zeros(count), np.ones(40), bends, np.full(2, 1e-3))
 
     def minimum(weights):
@@ -118,7 +118,7 @@ def test_a_law_that_nothing_bends_has_no_prior_of_derivatives():
     """Its precision went to infinity, with a warning of NumPy."""
     everything, one = np.ones(1, bool), np.ones(1)
     bends = bends_of(Ramp(jnp.ones(1)), np.array([[0.5], [1.0]]), one)
-    evidence = Evidence(np.full(3, -1), (), np.zeros(0), (everything,), (everything,))
+    evidence = Evidence(np.full(3, -1), (), np.zeros(0), (everything,), laws=(everything,))
     weights = Weights(np.ones(3), one, np.zeros(1), np.ones(3), bends, np.ones(2))
     found = Evaluation(np.zeros(3), np.ones((3, 1)))
     factors = Factors.of(*weights.applied(one, found), 1e-12)
