@@ -265,8 +265,9 @@ CLASSES = (  # of reasons: what an error says, and what that means
 EXPLAINED = {
     "Electrical.Analog.Examples.OpAmps.SignalGenerator": "three starts satisfy its equations; the run begins at the "
     "unstable one, where the oscillator rests",
-    "Mechanics.Translational.Examples.HeatLosses": "a mass that hits a stop is set to rest by `reinit`. The reference keeps "
-    "the speeds of its neighbours relative to it, as its states, so that they stop, too; here they keep their own",
+    "Mechanics.Translational.Examples.HeatLosses": "a mass that hits a stop is set to rest by `reinit`. "
+    "The reference keeps the speeds of its neighbours relative to it, as its states, so that they stop, too; here they "
+    "keep their own",
 }
 HEAD = """# The Modelica library
 
