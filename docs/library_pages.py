@@ -20,8 +20,7 @@ from sympy.printing.str import StrPrinter
 import jaxonomy_dae.library
 from jaxonomy_dae import Component, Domain, EqnEnv
 from jaxonomy_dae.modeling.arrays import ComponentArray, PortArray
-from jaxonomy_dae.modeling.event_flags import EventFlag
-from jaxonomy_dae.modeling.events import Assign, Reinit, Sampled, Terminate
+from jaxonomy_dae.modeling.events import Assign, EventFlag, Reinit, Sampled, Terminate
 from jaxonomy_dae.modeling.interval import Interval
 from jaxonomy_dae.modeling.symbols import ParameterSymbol, RelationSymbol
 

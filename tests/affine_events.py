@@ -18,7 +18,7 @@ from jaxonomy_dae.hybrid.facts import EventFacts
 from jaxonomy_dae.hybrid.problem import AbstractHybridProblem, HybridTerm
 from jaxonomy_dae.hybrid.solver import WithEvents
 from jaxonomy_dae.hybrid.start import start
-from jaxonomy_dae.modeling.event_flags import NO_FLAG, EventFlag
+from jaxonomy_dae.modeling.events import NO_FLAG, EventFlag
 from jaxonomy_dae.solvers.drive import integrate
 
 STATES, DISCRETES, CLOCKS = 4, 4, 3

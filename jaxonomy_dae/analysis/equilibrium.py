@@ -21,7 +21,7 @@ from ..aliases import Args, Time
 from ..initialization.ladder import FAILED, find_root, looking
 from ..initialization.problem import frozen_inputs
 from ..initialization.sizes import Sizes
-from ..linear.least_squares import least_squares
+from ..linear.dense import least_squares
 from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale, quantity_bounds
 from ..programs.cache import compiled

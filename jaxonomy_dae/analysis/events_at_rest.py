@@ -21,7 +21,7 @@ from jax import Array
 from ..aliases import Args, Time
 from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from ..system.system import AcausalSystem
 from ..tolerances import solved
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..linear.least_squares import least_squares
+from ..linear.dense import least_squares
 
 STEPS = 200  # from a hundredth of the fastest time constant, three times as long each, they pass thirty decades
 LONGER, SHORTER = 3.0, 0.25

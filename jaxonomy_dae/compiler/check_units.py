@@ -17,8 +17,7 @@ from ..expressions.to_sympy import shortened
 from ..modeling.component import Component
 from ..modeling.declarations import START, Parameter, Variable
 from ..modeling.diagram import AcausalDiagram
-from ..modeling.event_flags import EventFlag
-from ..modeling.events import Sampled, Terminate, When
+from ..modeling.events import EventFlag, Sampled, Terminate, When
 from ..modeling.symbols import TIME_LABEL, symbol_label
 from ..units.fit import misfit_of_units, misfits_of_condition, misfits_of_equation, misfits_of_value
 from ..units.parse import UnknownUnit, read_unit

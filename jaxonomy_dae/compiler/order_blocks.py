@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..diagnosis.wording import itemised
 from ..errors import StructuralError
-from ..model.reduced import ReducedModel
+from ..model.quantities import ReducedModel
 from ..model.tables import provenance_of
 from ..structure.matching import maximum_matching
 from .select_states import StateSelection

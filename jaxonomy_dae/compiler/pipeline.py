@@ -23,9 +23,8 @@ from ..diagnosis.structure import check_structure
 from ..diagnosis.unused_parameters import note_unused
 from ..diagnosis.wording import listed
 from ..errors import ModelError
-from ..model.incidence import incidence
-from ..model.quantities import map_quantities
-from ..model.reduced import ReducedModel
+from ..model.entries import incidence
+from ..model.quantities import ReducedModel, map_quantities
 from ..model.tables import FlatModel
 from ..structure.pantelides import match_highest
 from .check_pivots import check_pivots

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..diagnosis.wording import listed
 from ..errors import ModelError, nearest
-from ..model.reduced import ReducedModel
+from ..model.quantities import ReducedModel
 from ..model.tables import FlatModel
 
 Merit = tuple[int, int, int]  # how strongly it was asked for, whether it is fixed at the start, and has a start

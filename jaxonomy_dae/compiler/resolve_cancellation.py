@@ -18,7 +18,7 @@ from ..expressions.differentiate import partial_derivative
 from ..expressions.errors import KernelWithErrors
 from ..expressions.node import Node, constant
 from ..expressions.substitute import substitute
-from ..model.incidence import incidence
+from ..model.entries import incidence
 from ..model.provenance import Provenance, combination
 from ..model.tables import ZERO, EquationGroup, ParameterTable, equation_offsets, provenance_of
 from ..modeling.symbols import TIME_LABEL

@@ -23,7 +23,7 @@ from ..model.constraint_jacobian import constraint_entries, evaluate, evaluate_e
 from ..model.declared import declared_scale
 from ..model.extended import Extended
 from ..model.group import Point
-from ..model.reduced import ReducedModel
+from ..model.quantities import ReducedModel
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 from ..model.typical_sizes import typical_sizes, unrounded_sizes
 from ..tolerances import ALIKE, KNOWN

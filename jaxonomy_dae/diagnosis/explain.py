@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..model.coefficients import Entries
+from ..model.entries import Entries
 from ..model.tables import ZERO, AliasTable, FlatModel, equation_offsets, provenance_of
 from ..tolerances import NO_PART, RANK
 from .wording import DomainWords, listed, words

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..model.networks import Networks
+from ..model.opaque import Networks
 from ..model.tables import EquationGroup
 from .wording import some
 

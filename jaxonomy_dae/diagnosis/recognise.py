@@ -22,7 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from ..model.coefficients import Entries, entries_of
+from ..model.entries import Entries, entries_of
 from ..model.linear_template import LinearTemplate
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from .explain import Explainer

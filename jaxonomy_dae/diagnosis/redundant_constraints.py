@@ -36,7 +36,7 @@ from ..model.constraint_jacobian import (
 from ..model.group import Group, Point
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance
-from ..model.reduced import ReducedModel
+from ..model.quantities import ReducedModel
 from ..model.tables import ZERO, AliasTable, FlatModel, equation_offsets, provenance_of
 from ..model.typical_sizes import typical_sizes
 from ..tolerances import HALF_OF_THE_DIGITS, KNOWN, NO_PART, UNCHANGED

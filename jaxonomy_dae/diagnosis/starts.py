@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import StructuralError
 from ..model.declared import leading_starts
 from ..model.linear_template import LinearTemplate
-from ..model.reduced import ReducedModel
+from ..model.quantities import ReducedModel
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence, compress

@@ -8,7 +8,7 @@ equations.
 import numpy as np
 
 from ..errors import StructuralError
-from ..model.incidence import incidence
+from ..model.entries import incidence
 from ..model.provenance import Provenance
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, provenance_of
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn

@@ -11,7 +11,7 @@ from jax import Array, lax
 from ..adjoint.closure_conversion import written
 from ..adjoint.resting import still
 from ..aliases import Args, Time
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from .first_order import constant_once
 from .instant import Arrival, Happening, Instant, is_zero, within
 from .modes import Search, sets_to_flip

@@ -20,7 +20,7 @@ from jax import Array, lax
 
 from ..adjoint.closure_conversion import any_member
 from ..aliases import Args, Time
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from .after_event import aftermath
 from .instant import Arrival, Happening, Instant, is_zero
 from .log import EventRows

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool
 
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 
 
 @dataclasses.dataclass(frozen=True)

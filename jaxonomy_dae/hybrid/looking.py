@@ -11,7 +11,7 @@ from jax import Array, lax
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
 from ..aliases import Args, State, Time
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from ..tolerances import WINDOW
 from .after_event import AHEAD
 from .instant import CLOSE, Arrival

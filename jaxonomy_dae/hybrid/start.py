@@ -9,7 +9,7 @@ from jax import Array, lax
 
 from ..adjoint.resting import still
 from ..aliases import Args, State, Time
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from .event_map import handle
 from .instant import Arrival
 from .log import EventRows

@@ -9,7 +9,7 @@ from ..lowering.plan import SystemPlan
 from ..model.consistent_point import consistent_point
 from ..model.declared import start_guess
 from ..model.group import Point
-from ..model.networks import Networks
+from ..model.opaque import Networks
 
 
 def constraints_at(

@@ -10,7 +10,7 @@ import optimistix
 from jaxtyping import Array, Bool, Float
 
 from ..errors import ModelError
-from ..linear.least_squares import least_squares
+from ..linear.dense import least_squares
 from ..tolerances import solved
 from .ladder import FAILED, GIVEN, Found
 from .sizes import Sizes, column_sizes, row_sizes, soft_weight, weighed

@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 
 from ..errors import ModelError
-from ..linear.least_squares import least_squares
+from ..linear.dense import least_squares
 from ..linear.sparse import sparse_jacobian
 from ..linear.whole import solve_whole
 from ..lowering.plan import SystemPlan

@@ -28,7 +28,7 @@ from ..lowering.remembered import remembered
 from ..model.declared import declared_scale
 from ..model.jacobian import generic_jacobian
 from ..model.natural_sizes import natural_sizes
-from ..model.networks import Networks
+from ..model.opaque import Networks
 from ..model.quantities import ABSENT
 from ..model.starts import Start
 from ..model.tables import ZERO, complete

@@ -16,7 +16,7 @@ from ..lowering.plan import SystemPlan
 from ..lowering.remembered import remembered
 from ..lowering.schedule import SparseStep, Step, StepEquation
 from ..model.group import Group, Point
-from ..model.networks import Networks
+from ..model.opaque import Networks
 from ..model.tables import ZERO
 from ..model.typical_sizes import typical_sizes
 from ..tolerances import ILL_CONDITIONED, SLIGHT

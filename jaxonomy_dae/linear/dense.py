@@ -1,16 +1,19 @@
-"""LU factors of dense matrices, and solves with them.
+"""LU factors of dense matrices, solves with them, and least squares where a matrix leaves directions open.
 
 Rows are scaled to largest entries near one before pivots are compared: the unit of an equation must not decide which
 row is a pivot's. Scales are powers of two, so that scaling rounds nothing. Matrices may come in batches, along leading
-axes. Nothing here is differentiated but `solve_dense`.
+axes. Nothing here is differentiated but `solve_dense` and `least_squares`.
 """
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
+
+from ..tolerances import ridge
 
 # What XLA need not look for in the order of rows.
 PERMUTATION: Any = {"mode": "promise_in_bounds", "wrap_negative_indices": False, "unique_indices": True}
@@ -87,3 +90,16 @@ def _each(function: Any, order: Any) -> Any:
     for _ in order.shape[:-1]:
         function = jax.vmap(function)
     return function
+
+
+def least_squares(matrix: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:
+    """The least-squares solution of A·x = b, rows equilibrated; near the one of least norm where A leaves directions
+    open. Rows of zeros say nothing, whatever stands in b. Differentiable with respect to b alone."""
+    m, n = matrix.shape
+    largest = jnp.max(jnp.abs(matrix), axis=1, initial=0.0)
+    empty = largest < float(jnp.finfo(matrix.dtype).tiny)
+    scale = jnp.where(empty, 0, 1 / jnp.where(empty, 1, largest))
+    held = jnp.asarray(ridge(matrix.dtype) * np.eye(n), matrix.dtype)
+    stacked = jnp.concatenate([scale[:, None] * matrix, held])
+    q, r = jnp.linalg.qr(jax.lax.stop_gradient(stacked))
+    return jax.scipy.linalg.solve_triangular(r, q[:m].T @ (scale * right))

@@ -4,8 +4,8 @@ import numpy as np
 
 from ..model.declared import quantity_scale, start_guess
 from ..model.group import Point
-from ..model.networks import Networks
-from ..model.reduced import ReducedModel
+from ..model.opaque import Networks
+from ..model.quantities import ReducedModel
 
 
 class EntrySizes:

@@ -20,8 +20,7 @@ from ..model.quantities import QuantityMap
 from ..model.symbolic import SymbolicTemplate, parameter_label, slot_label, template_of
 from ..model.tables import ZERO, FlatModel
 from ..model.template import AbstractTemplate
-from ..modeling.event_flags import EventFlag
-from ..modeling.events import LIVE
+from ..modeling.events import LIVE, EventFlag
 from ..structure.matching import maximum_matching
 from .schedule import AnyStep, Step, StepEquation
 

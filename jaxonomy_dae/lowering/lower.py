@@ -17,8 +17,7 @@ from .entry_sizes import EntrySizes
 from .gather import NOTHING
 from .live_relations import without_live_relations
 from .plan import InputTable, PlannedRow, SystemPlan
-from .plan_events import plan_events
-from .plan_held import plan_held
+from .plan_events import plan_events, plan_held
 from .plan_waves import plan_waves
 from .program import Layout, Program, plan, plan_equation
 from .schedule import AnyStep, build_schedule, equation_of, needed

@@ -17,13 +17,11 @@ from ..model.extended import Extended
 from ..model.identity import Identity
 from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
-from ..model.quantities import QuantityMap
-from ..model.reduced import ReducedModel
+from ..model.quantities import QuantityMap, ReducedModel
 from ..model.tables import ZERO, FlatModel, provenance_of
 from . import pattern
 from .gather import Gather
-from .plan_events import EventPlan
-from .plan_held import HeldPlan
+from .plan_events import EventPlan, HeldPlan
 from .plan_waves import WaveGroup
 from .program import PlannedEquation, Program, plan
 from .schedule import TORN, AnyStep, needed

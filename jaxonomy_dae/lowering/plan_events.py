@@ -1,4 +1,4 @@
-"""How a compiled system evaluates its events: programs for conditions and for what events write."""
+"""How a compiled system evaluates its events and the constraints that come and go with modes."""
 
 import dataclasses
 import graphlib
@@ -13,7 +13,7 @@ from ..model.extended import Extended
 from ..model.quantities import QuantityMap
 from ..model.starts import Formulas
 from ..model.tables import ZERO, FlatModel
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from .gather import NOTHING, Gather
 from .program import Program
 from .schedule import AnyStep
@@ -249,3 +249,28 @@ def _following(flat: FlatModel) -> tuple[Formulas, ...]:
             moved[group.target[rows]] = True
             found.append(group.take(rows))
     return tuple(found)
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldPlan:
+    """The branches of `either` that are differentiated, as `table` lists them."""
+
+    table: HeldTable
+    active_program: Program
+    active: Gather
+    level_program: Program
+    level: Gather
+    force_program: Program
+    force: Gather
+    last: np.ndarray  # (held,): the level of each that jumps
+
+
+def plan_held(table: HeldTable, variables: QuantityMap, program: Callable[[np.ndarray], Program]) -> HeldPlan | None:
+    """Plans the constraints of a model; `program` makes the program that computes chosen quantities. None if it has
+    none."""
+    if not len(table):
+        return None
+
+    last = np.searchsorted(table.owner, np.arange(len(table)), side="right") - 1
+    active, level, force = (read_variables(variables, v, program) for v in (table.active, table.level, table.force))
+    return HeldPlan(table, *active, *level, *force, last)

@@ -12,8 +12,8 @@ from .declared import start_guess
 from .extended import Extended
 from .group import Point
 from .jacobian import residual_and_jacobian
-from .networks import Networks
-from .reduced import ReducedModel
+from .opaque import Networks
+from .quantities import ReducedModel
 from .tables import Declared
 
 # Quantities up to which singular values are computed, in some 0.05 s at 300. Beyond, one sparse factorization solves to

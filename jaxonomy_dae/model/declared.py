@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Int
 
-from .reduced import ReducedModel
+from .quantities import ReducedModel
 
 
 def declared_scale(model: ReducedModel) -> np.ndarray:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from .starts import Start
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..aliases import Numeric
-from .networks import Networks
+from .opaque import Networks
 from .template import AbstractTemplate
 
 G = TypeVar("G", bound="Group")

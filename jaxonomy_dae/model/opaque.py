@@ -3,6 +3,7 @@
 import abc
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -188,3 +189,19 @@ class OpaqueTemplate(AbstractTemplate):
 
         basis = jnp.eye(len(slots), dtype=values.dtype).reshape(len(slots), len(slots), *[1] * (values.ndim - 1))
         return tuple(jax.vmap(along)(jnp.broadcast_to(basis, (len(slots), *values.shape))))
+
+
+class Networks:
+    """The weights of learned terms, and each network's value, computed once for equal arguments."""
+
+    def __init__(self, weights: tuple[PyTree, ...]):
+        self.weights = weights
+        self._seen: dict[tuple, tuple[Any, Any]] = {}
+
+    def evaluate(self, opaque: OpaqueFunction, order: int, t, inputs: list[list]) -> Array:
+        """The outputs' `order`-th time derivative, shape (outputs,) or (outputs, instances)."""
+        key = (opaque.index, order, id(t), *(id(x) for level in inputs for x in level))
+        if key not in self._seen:
+            value = opaque.derivatives(self.weights[opaque.index], order, t, inputs)
+            self._seen[key] = (value, (t, inputs))  # the arguments are kept, so that their ids stay taken
+        return self._seen[key][0]

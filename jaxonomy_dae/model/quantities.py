@@ -1,12 +1,13 @@
-"""Which quantity each variable is, and what quantities are called."""
+"""Which quantity each variable is, what quantities are called, and the model that is left in them."""
 
 import dataclasses
+import functools
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from .extended import Quantities
-from .tables import ZERO, AliasTable, FlatModel
+from .extended import Extended, Quantities
+from .tables import ZERO, AliasTable, EquationGroup, FlatModel, provenance_of
 
 ABSENT = -2  # the quantity of a variable that occurs in none of the remaining equations
 
@@ -45,3 +46,23 @@ def name_quantities(flat: FlatModel, variables: QuantityMap, quantities: Quantit
     for k in np.setdiff1d(np.arange(quantities.n), named).tolist():
         names[k] = f"der({names[k - 1]})"
     return names
+
+
+@dataclasses.dataclass(frozen=True)
+class ReducedModel:
+    """A flattened model with the equations that are left of it, and the quantities that they are left in."""
+
+    flat: FlatModel
+    alias: AliasTable
+    groups: tuple[EquationGroup, ...]  # the equations that are left, as they are to be differentiated
+    extended: Extended  # with their derivatives
+    variables: QuantityMap
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """A user's name for every quantity."""
+        return tuple(name_quantities(self.flat, self.variables, self.extended.quantities))
+
+    def text(self, equation: int) -> str:
+        """The text of an equation as written."""
+        return str(provenance_of(self.groups, equation))

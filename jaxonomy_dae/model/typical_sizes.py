@@ -10,7 +10,7 @@ from .declared import declared_scale
 from .extended import Extended
 from .jacobian import generic
 from .natural_sizes import Factors, natural_sizes
-from .reduced import ReducedModel
+from .quantities import ReducedModel
 
 MOVED = 1e-6  # of parameters: a difference from which a slope is told to six digits
 DECADES = 30  # that they may span: single precision has 38

@@ -15,8 +15,7 @@ import sympy
 
 from ..aliases import Condition
 from ..errors import ModelError
-from ..modeling.event_flags import EventFlag
-from ..modeling.events import Sampled, assign, pre, reinit, terminate
+from ..modeling.events import EventFlag, Sampled, assign, pre, reinit, terminate
 from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 from .before_only import BeforeOnly
 from .definitions import assigned_in, with_entries

@@ -11,7 +11,8 @@ from ..errors import ModelError, UnknownAttribute, nearest
 from .arrays import ComponentArray, make_array
 from .connections import Connection, Signal, resolve_ends
 from .construction import Construction
-from .declarations import INITIALLY, START, Account, Learned, Parameter, Value, Variable, full_name
+from .declarations import Account, Learned, Parameter, Value, Variable, full_name
+from .energy_declarations import EnergyDeclarations
 from .environment import EqnEnv
 from .equations import residual_of
 from .events import HeldBranch, When
@@ -22,12 +23,13 @@ from .networks import check_kind, count_outputs, of_scalars
 from .place import line_of_caller
 from .ports import Domain, Port
 from .real_number import real_number
+from .start_declarations import StartDeclarations
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
 
 ChildT = TypeVar("ChildT", bound="Component")
 
 
-class Component(ModeDeclarations, metaclass=Construction):
+class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metaclass=Construction):
     """The base class of all components: subclass it, and declare physics in `__init__`.
 
     ```python
@@ -313,58 +315,6 @@ class Component(ModeDeclarations, metaclass=Construction):
             for k, s in enumerate(starts)
         )
 
-    def start(self, derivative: object, value: Value, fixed: bool = False) -> None:
-        """Prescribes a derivative at the initial time: `self.start(der(x), 2.0)`.
-
-        **Arguments:**
-
-        - `derivative`: `der(x)`, `der(der(x))`, … of a variable of this component or of a child.
-        - `value`: a number or an expression in parameters.
-        - `fixed`: whether it must hold. If not, it is a guess for the search for a consistent initial point. A guess
-            matters if the equations have several solutions for the derivative, or leave it free.
-
-        **Raises:**
-
-        - `ModelError` if the first argument is not the derivative of a variable, if this derivative already has a
-            start, and for wrong values as in `variable`.
-        """
-        if not isinstance(derivative, VariableSymbol) or not derivative.order:
-            mend = (
-                "; for the variable itself, say start= where it is declared"
-                if str(derivative) in self.variables
-                else ""
-            )
-            found = f"got {derivative}{mend}"
-            raise ModelError(f"component '{self.name}': start takes a derivative such as der(x); {found}")
-        name = f"{derivative}{START}"
-        if name in self.variables:
-            raise ModelError(f"component '{self.name}': {derivative} has a start already")
-        self._check_open(f"say the start of {derivative}")
-        self.add_equations(sympy.Eq(self._declare(name, "start", value, fixed), derivative, evaluate=False))
-
-    def initially(self, *equations: sympy.Basic) -> None:
-        """Adds equations that hold at the initial time: `self.initially(Eq(der(T), 0))` starts at rest.
-
-        Each equation replaces one fixed start. Starts that are not fixed give way.
-
-        **Arguments:**
-
-        - `equations`: SymPy `Eq`s, or expressions that are zero, in variables, their derivatives and parameters.
-
-        **Raises:**
-
-        - `ModelError` for what is not an equation.
-        """
-        self._check_open("add its initial equations")
-        for equation in equations:
-            try:
-                residual = residual_of(equation)
-            except (ModelError, TypeError) as error:
-                raise ModelError(f"component '{self.name}': initially: {error}") from None
-            number = sum(name.startswith(INITIALLY) for name in self.variables)
-            symbol = self._declare(f"{INITIALLY}[{number}]", "event", 0.0, True)
-            self.equations.append(symbol - residual)
-
     def input(self, name: str, default: float | None = None, unit: str = "") -> VariableSymbol:
         """Declares an input: a function of time given to `simulate(inputs={"component.name": ...})`.
 
@@ -498,49 +448,6 @@ class Component(ModeDeclarations, metaclass=Construction):
             self.equations.append(residual)
             if line != self._line:
                 self._lines.setdefault(residual, line)
-
-    # --- energy ------------------------------------------------------------------------------------------------
-
-    def declare_energy(self, *expressions: object) -> None:
-        """Declares the energy that the component stores (joule): `self.declare_energy(m * v**2 / 2)`.
-
-        `solution.energy()` reads the declarations of energy, dissipation and supply, and
-        `jaxonomy_dae.testing.assert_energy_balance` compares them. They are not equations, and simulations do not
-        compute them.
-
-        **Arguments:**
-
-        - `expressions`: expressions in variables, their derivatives and parameters of this component or of its
-            children, or names of its variables. Several are added up.
-
-        **Raises:**
-
-        - `ModelError` for an argument that is not an expression or a name; for unknown symbols, at compilation.
-        """
-        self._declare_accounts("energy", expressions)
-
-    def declare_dissipation(self, *expressions: object) -> None:
-        """Declares the power that the component loses to outside the model (watt): `d * v**2`. Heat that leaves through
-        a thermal port is not lost. Otherwise as `declare_energy`."""
-        self._declare_accounts("dissipation", expressions)
-
-    def declare_supply(self, *expressions: object) -> None:
-        """Declares the power that the component brings into the model from outside (watt). It is negative if the
-        component takes power out. Otherwise as `declare_energy`."""
-        self._declare_accounts("supply", expressions)
-
-    def _declare_accounts(self, kind: str, expressions: tuple[object, ...]):
-        self._check_open(f"declare its {kind}")
-        for given in expressions:
-            expression = self.symbol(given) if isinstance(given, str) else given
-            if isinstance(given, int | float):
-                expression = sympy.sympify(given)
-            if not isinstance(expression, sympy.Expr):
-                raise ModelError(
-                    f"component '{self.name}': {kind} is an expression in variables and parameters, or the name of a "
-                    f"variable; got {given!r}"
-                )
-            self.accounts.append(Account(kind, expression))
 
     # --- hierarchy ---------------------------------------------------------------------------------------------
 

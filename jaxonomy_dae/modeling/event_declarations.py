@@ -9,10 +9,11 @@ from ..errors import ModelError
 from ..expressions.from_sympy import symbols_of
 from .declarations import Value
 from .environment import EqnEnv
-from .event_flags import NO_FLAG, EventFlag
 from .events import (
+    NO_FLAG,
     Action,
     Assign,
+    EventFlag,
     Reinit,
     Sampled,
     Terminate,

@@ -6,8 +6,7 @@ from ..aliases import Condition, Expression
 from ..errors import ModelError
 from .declarations import Value
 from .equations import zero_of
-from .event_flags import EventFlag
-from .events import Assign, HeldBranch, relation_in_discretes
+from .events import Assign, EventFlag, HeldBranch, relation_in_discretes
 from .relation_declarations import RelationDeclarations
 from .symbols import DiscreteSymbol, RelationSymbol, der
 

@@ -10,8 +10,7 @@ from ..aliases import Condition, Expression
 from ..expressions.to_sympy import shortened
 from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, jumps, turned, varies, with_events
 from .event_declarations import EventDeclarations
-from .event_flags import NO_FLAG, EventFlag
-from .events import LIVE, Assign, Sampled, is_strict
+from .events import LIVE, NO_FLAG, Assign, EventFlag, Sampled, is_strict
 from .symbols import PreviousSymbol, RelationSymbol, VariableSymbol
 
 _ORDERED = (sympy.StrictLessThan, sympy.LessThan, sympy.StrictGreaterThan, sympy.GreaterThan)

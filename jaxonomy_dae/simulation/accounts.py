@@ -15,7 +15,7 @@ from jax import Array
 from ..aliases import Args, Numeric, State, Time, Times
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
-from ..model.networks import Networks
+from ..model.opaque import Networks
 from ..model.tables import ZERO, AccountGroup
 from ..programs.cache import compiled
 from ..programs.rows import at_times

@@ -13,7 +13,7 @@ from ..expressions.node import postorder
 from ..expressions.to_sympy import shortened, write
 from ..lowering.schedule import StepEquation
 from ..model.group import Point
-from ..model.networks import Networks
+from ..model.opaque import Networks
 from ..model.symbolic import SymbolicTemplate, number_label, parameter_label, slot_label
 from ..model.tables import ZERO
 from ..modeling.symbols import TIME_LABEL

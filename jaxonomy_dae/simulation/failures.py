@@ -17,7 +17,7 @@ from ..hybrid.rivals import pair_of
 from ..hybrid.solver import CLASH, MOVED, STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
 from ..model.events import Event
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from ..programs.members import failed_members, is_batched
 from ..programs.staging import is_traced, layers
 from ..solvers.choice_guard import SINGULAR_CHOICE

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ..aliases import Args, Time
 from ..errors import InitializationError, ModelError
 from ..initialization.initialize import InitialPoint, is_consistent
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from ..system.system import AcausalSystem
 
 ITERATIONS = 8  # Gauss–Newton steps onto the constraints; they converge quadratically, from 0.1 in four to rounding

@@ -17,7 +17,7 @@ from ..hybrid.facts import EventFacts
 from ..hybrid.first_order import constant_once
 from ..hybrid.problem import AbstractHybridProblem
 from ..lowering.plan_events import EventPlan
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from ..solvers.switching import Watch
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt

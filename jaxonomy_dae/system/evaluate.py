@@ -17,7 +17,7 @@ from ..linear.whole import solve_whole
 from ..lowering.gather import Chunk, Gather
 from ..lowering.program import Planned, PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
 from ..model.linear_template import LinearTemplate, scaled
-from ..model.networks import Networks
+from ..model.opaque import Networks
 from .nonlinear import AbstractBlock, Inside, Refinement, Whole, WrittenOut
 from .values import LONG_SUM, Values, filled, scaled_by
 

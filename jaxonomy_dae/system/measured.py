@@ -14,7 +14,7 @@ import numpy as np
 
 from ..lowering.gather import Chunk, Gather
 from ..lowering.program import PlannedLoop, PlannedSparse, PlannedStep
-from ..model.networks import Networks
+from ..model.opaque import Networks
 from .evaluate import Evaluation, Linear
 from .nonlinear import AbstractBlock, Refinement
 from .values import EquationAt, scaled_by, still

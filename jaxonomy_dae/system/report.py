@@ -6,12 +6,12 @@ import numpy as np
 
 from ..diagnosis.wording import counted
 from ..lowering.plan import SystemPlan
+from ..model.entries import incidence
 from ..model.events import EventTable
-from ..model.incidence import incidence
 from ..model.starts import Start
 from ..model.symbolic import SymbolicTemplate, number_label, parameter_label
 from ..model.tables import FlatModel, provenance_of
-from ..modeling.event_flags import EventFlag
+from ..modeling.events import EventFlag
 from ..structure.pantelides import Offsets, reduce_index
 from .sections import Sections, folded, some
 from .solver_choice import solver_choice

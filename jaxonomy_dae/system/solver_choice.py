@@ -10,7 +10,7 @@ from ..linear.sparse_least_squares import SparseLeastSquares
 from ..lowering.plan import SystemPlan
 from ..model.consistent_point import initial_point
 from ..model.jacobian import residual_and_jacobian
-from ..model.reduced import ReducedModel
+from ..model.quantities import ReducedModel
 from ..model.tables import Declared
 from ..solvers.solve import SMALL
 from ..tolerances import RANK, TINY

@@ -20,10 +20,9 @@ from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve
 from ..lowering.gather import SCALARS, Gather, entries, times
 from ..lowering.plan import PlannedRow, SystemPlan
-from ..lowering.plan_events import EventPlan
-from ..lowering.plan_held import HeldPlan
+from ..lowering.plan_events import EventPlan, HeldPlan
 from ..lowering.program import Program
-from ..model.networks import Networks
+from ..model.opaque import Networks
 from ..model.starts import Start, formulas_of
 from ..programs.staging import is_traced, joined, on_device
 from ..solvers.field_size import is_large

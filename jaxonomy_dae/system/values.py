@@ -11,7 +11,7 @@ import numpy as np
 from ..lowering.gather import FEW, Chunk, Gather, entries, take, times
 from ..lowering.program import PlannedEquation, PlannedSparse, PlannedStep
 from ..model.linear_template import LinearTemplate
-from ..model.networks import Networks
+from ..model.opaque import Networks
 from ..model.tables import ZERO
 
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum

@@ -30,7 +30,7 @@ from jaxonomy_dae.hybrid.control import ENDED
 from jaxonomy_dae.hybrid.side import RESTS
 from jaxonomy_dae.hybrid.solver import NOT_FINITE, STUCK, TOO_MANY
 from jaxonomy_dae.hybrid.start import start
-from jaxonomy_dae.modeling.event_flags import NO_FLAG, EventFlag
+from jaxonomy_dae.modeling.events import NO_FLAG, EventFlag
 from jaxonomy_dae.solvers import StoredAdjoint
 
 SAVED = 60

@@ -20,7 +20,7 @@ from jaxonomy_dae.hybrid.first_order import differentiable_once
 from jaxonomy_dae.hybrid.problem import AbstractHybridProblem, HybridTerm
 from jaxonomy_dae.hybrid.solver import WithEvents
 from jaxonomy_dae.hybrid.start import start
-from jaxonomy_dae.modeling.event_flags import EventFlag
+from jaxonomy_dae.modeling.events import EventFlag
 from jaxonomy_dae.solvers import StoredAdjoint
 from jaxonomy_dae.solvers.drive import integrate
 

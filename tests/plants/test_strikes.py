@@ -9,7 +9,7 @@ import pytest
 from problems import compiled
 
 from jaxonomy_dae import Component, EqnEnv, der, simulate
-from jaxonomy_dae.modeling.event_flags import EventFlag
+from jaxonomy_dae.modeling.events import EventFlag
 from jaxonomy_dae.simulation.hybrid_problem import problem_for
 
 G = 9.81

@@ -11,13 +11,13 @@ from .ideal import IdealTransformer as IdealTransformer
 from .machines import EMF as EMF
 from .machines import DCMotor as DCMotor
 from .passive import Capacitor as Capacitor
+from .passive import Diode as Diode
 from .passive import HeatedResistor as HeatedResistor
 from .passive import Inductor as Inductor
 from .passive import Memristor as Memristor
 from .passive import MutualInductor as MutualInductor
 from .passive import Potentiometer as Potentiometer
 from .passive import Resistor as Resistor
-from .semiconductors import Diode as Diode
 from .sensors import CurrentSensor as CurrentSensor
 from .sensors import PowerSensor as PowerSensor
 from .sensors import VoltageSensor as VoltageSensor

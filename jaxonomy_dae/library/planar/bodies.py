@@ -3,7 +3,7 @@
 from sympy import cos, sin
 
 from ...modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Planar, Value, der
-from .two_frames import TwoFrames
+from .joints import TwoFrames
 
 
 class World(Component):

@@ -4,7 +4,7 @@ from sympy import sqrt
 
 from ...modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Planar, Value, der
 from ..arguments import yes_or_no
-from .two_frames import TwoFrames
+from .joints import TwoFrames
 
 
 class SpringDamper(TwoFrames):

@@ -1,9 +1,23 @@
-"""Joints between two frames, with a flange for what drives or brakes them."""
+"""Joints between two frames, with a flange for what drives or brakes them, and the balance that all pairs share."""
 
+import sympy
 from sympy import cos, sin
 
-from ...modeling import Eq, EqnEnv, Rotational, Translational, Value, der
-from .two_frames import TwoFrames
+from ...modeling import Component, Eq, EqnEnv, Planar, Rotational, Translational, Value, der
+from ...modeling.ports import Port
+
+
+class TwoFrames(Component):
+    """Two frames without mass between them: what enters at one leaves at the other."""
+
+    def _two_frames(self) -> tuple[Port, Port]:
+        return self.port("frame_a", Planar), self.port("frame_b", Planar)
+
+    def _balance(self, dx: Value = 0, dy: Value = 0) -> None:
+        """The forces and the torques about frame_a sum to zero, with frame_b at (dx, dy) from it in world axes."""
+        a, b = self.ports["frame_a"], self.ports["frame_b"]
+        lever = sympy.sympify(dx) * b.fy - sympy.sympify(dy) * b.fx
+        self.add_equations(Eq(a.fx + b.fx, 0), Eq(a.fy + b.fy, 0), Eq(a.tau + b.tau + lever, 0))
 
 
 class Revolute(TwoFrames):

@@ -3,7 +3,7 @@
 from sympy import cos, sin
 
 from ...modeling import Component, Eq, EqnEnv, Planar, der
-from .two_frames import TwoFrames
+from .joints import TwoFrames
 
 
 class AbsoluteSensor(Component):
