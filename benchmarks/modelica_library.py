@@ -74,44 +74,48 @@ def _arguments() -> argparse.Namespace:
 
 def _in_a_process(file: Path, asked: argparse.Namespace) -> dict:
     """The row of one file, from a copy of this process, which has imported everything already."""
-    start = time.monotonic()
     here, there = multiprocessing.Pipe(duplex=False)
     child = multiprocessing.get_context("fork").Process(target=_with_limits, args=(there, file, asked))
     child.start()
     there.close()
+    row: dict = {"model": file.stem, "reached": "nothing", "seconds": asked.seconds}
     try:
-        return here.recv()
+        while True:  # a row after each stage: the last one stands, also if the process is killed thereafter
+            row = here.recv()
     except EOFError:
         child.join()
-        why = "late" if child.exitcode in (-9, -24) else f"the process ended with {child.exitcode}"
-        return {"model": file.stem, "error": why, "seconds": round(time.monotonic() - start, 1)}
-    finally:
-        child.join()
+    if child.exitcode in (-9, -24):
+        row |= {"error": "late", "seconds": asked.seconds}
+    elif child.exitcode:
+        row["error"] = f"the process ended with {child.exitcode}"
+    return row
 
 
 def _with_limits(there: Any, file: Path, asked: argparse.Namespace) -> None:
     used = int(time.process_time())
     resource.setrlimit(resource.RLIMIT_CPU, (used + asked.seconds, used + asked.seconds + 5))
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
-    there.send(_one(file, Path(asked.references), not asked.no_gradients))
+    for row in _rows(file, Path(asked.references), not asked.no_gradients):
+        there.send(row)
 
 
-def _one(file: Path, references: Path, gradients: bool) -> dict:
-    """The row of one file, in this process."""
+def _rows(file: Path, references: Path, gradients: bool):
+    """The row of one file, in this process, after each stage and at the end."""
     sys.setrecursionlimit(20_000)
     warnings.simplefilter("ignore")
-    row: dict = {"model": file.stem, "reached": "nothing"}
+    row: dict = {"model": file.stem, "reached": "nothing", "seconds": 0.0}
     start = time.process_time()
     try:
         for stage in _stages(file, references, gradients, row):
             row["reached"] = stage
-            row[f"until_{stage}"] = round(time.process_time() - start, 2)
+            row[f"until_{stage}"] = row["seconds"] = round(time.process_time() - start, 2)
+            yield row
     except MemoryError:
         row["error"] = "memory"
     except Exception as error:
         row["error"] = f"{type(error).__name__}: {error}"[:600]
     row["seconds"] = round(time.process_time() - start, 2)
-    return row
+    yield row
 
 
 def _stages(file: Path, references: Path, gradients: bool, row: dict):
