@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..linear.arrays import triangular, where
 from ..tolerances import NOISE, ZERO_WITHIN, close, solved, spacing
-from .arrays import triangular, where
 from .search import Base, Descent, Equations, Judged, Linear, Look, Rung, Search
 from .sizes import row_sizes, weighed
 

@@ -6,7 +6,7 @@ are passed, where descent methods stop. Where the curve to one side ends, the ot
 
 from typing import Any, NamedTuple
 
-from .arrays import where
+from ..linear.arrays import where
 from .search import Curve, Equations, Judged, Linear, Rung, Search
 
 LIMIT = 200  # evaluations

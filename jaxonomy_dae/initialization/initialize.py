@@ -9,7 +9,7 @@ Where values are known the search runs outside of programs (`search_outside`), a
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,6 +20,7 @@ from jax.core import Tracer
 
 from ..errors import ModelError
 from ..linear.dense import least_squares
+from ..linear.newton import twice
 from ..linear.sparse import sparse_jacobian
 from ..linear.whole import solve_whole
 from ..lowering.plan import SystemPlan
@@ -99,7 +100,7 @@ def initialize(
             step = least_squares(jacobian, jnp.where(good, remaining, 0))
             return w - step * root.unit, (remaining, step)
 
-        w, (remaining, step) = _twice(correct, root.x)
+        w, (remaining, step) = twice(correct, root.x)
     limit = jnp.where(problem.is_soft, jnp.inf, root.limit)
     if problem.excused is not None:
         limit = limit + problem.excused
@@ -265,7 +266,7 @@ def _large_point(problem: InitialProblem, sparse: SparseRows) -> InitialPoint:
         step = solve_whole(sparse.square, values[sparse.inside], remaining[sparse.core], checked=False)
         return jnp.where(good, w - step, w), remaining
 
-    w, remaining = _twice(correct, x)
+    w, remaining = twice(correct, x)
     if problem.rows.n_soft:
 
         def some_cannot():
@@ -313,22 +314,9 @@ def _nearest_point(problem: InitialProblem, w, jacobian, unit, good) -> tuple[An
         return z - least_squares(matrix, jnp.where(good, conditions(z, data), 0))
 
     z = jax.lax.stop_gradient(correct(jax.lax.stop_gradient(z), settings))
-    z, _ = _twice(lambda z: (correct(z, moving), None), z)
+    z, _ = twice(lambda z: (correct(z, moving), None), z)
     w = z[: len(w)] * unit
     return w, problem.residual(jax.lax.stop_gradient(w), moving)
-
-
-def _twice(step: Callable[[Any], tuple[Any, Any]], w: Any) -> tuple[Any, Any]:
-    """w after two steps, in a loop, so that they are compiled once; and what the first one found on the way, which is
-    carried on: JAX cannot transpose a scan if none of what it collects is read (jax 0.10.2)."""
-    none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, w)[1])
-
-    def once(carry: Any, first: Any) -> Any:
-        w, seen = carry
-        w, new = step(w)
-        return (w, jax.tree.map(lambda a, b: jnp.where(first, a, b), new, seen)), None
-
-    return jax.lax.scan(once, (w, none), np.array([True, False]))[0]
 
 
 def is_consistent(found: InitialPoint) -> Any:

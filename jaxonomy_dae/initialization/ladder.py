@@ -29,9 +29,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..linear.arrays import Numbers, loop, namespace, where
 from ..tolerances import close, solved
 from . import gauss_newton, homotopy
-from .arrays import Numbers, loop, namespace, where
 from .probing import Probed, probed
 from .search import Base, Curve, Descent, Equations, Judged, Look, Probe, Rung, Search
 from .sizes import Sizes, column_sizes, row_sizes, weighed

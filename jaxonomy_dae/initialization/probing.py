@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .arrays import where
+from ..linear.arrays import where
 from .search import Equations, Look, Probe, Search
 from .sizes import column_sizes
 

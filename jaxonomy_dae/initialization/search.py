@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from .arrays import namespace, where
+from ..linear.arrays import namespace, where
 from .sizes import Sizes, soft_weight
 
 # A step that would cross a bound goes this part of the way to it: at the bound itself a root or logarithm may have no

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..linear.arrays import Numbers, namespace
 from ..tolerances import DIGIT, NOISE, solved, spacing
-from .arrays import Numbers, namespace
 
 
 class Sizes(NamedTuple):

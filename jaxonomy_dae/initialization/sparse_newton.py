@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..linear.choice import SPARSE_DENSITY, SPARSE_FROM
+from ..linear.newton import Tried, newton
 from ..linear.sparse import SparsePattern, available, is_double, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..lowering.plan import SystemPlan
@@ -97,10 +98,6 @@ def sparse_newton(
     unit = jnp.where(sizes.known > 0, sizes.known, 1)
     jacobian = sparse_jacobian(function, rows.pattern)
 
-    def evaluate(x):
-        value, values = jax.lax.stop_gradient((function(x), jacobian(x)))
-        return value, values, *sizes_of_rows(x, values)
-
     def sizes_of_rows(x, values):
         slopes = jnp.where(jnp.isfinite(values), jnp.abs(values), 0)
         return row_sizes(lambda v: rows.pattern.multiply(slopes, v), x, sizes, unit, magnitude(x))
@@ -110,41 +107,21 @@ def sparse_newton(
         found = jnp.zeros(rows.pattern.n_rows, dtype).at[rows.pattern.rows].max(moved)
         return 1 / jnp.where((found > 0) & (found < jnp.inf), found, 1)
 
-    def merit_of(value, weight):
-        return jnp.sqrt(jnp.sum((weight * value)[rows.core] ** 2))
+    def look(x, part, last):
+        weight, least, *_ = last
+        value, values = jax.lax.stop_gradient((function(x), jacobian(x)))
+        size, noise = sizes_of_rows(x, values)
+        weight = jnp.where(least < jnp.inf, weight, largest(values))
+        merit = jnp.sqrt(jnp.sum((weight * value)[rows.core] ** 2))
+        inside = jnp.all((x >= low) & (x <= high))
+        holds = inside & jnp.all(jnp.abs(value) <= close * size + noise)
+        falls = inside & (merit < (1 - DECREASE * part) * least)
+        step = -solve_whole(rows.square, values[rows.inside], value[rows.core], checked=False)
+        limit = enough * size + noise
+        return Tried(falls, holds, step, (weight, merit, limit, jnp.all(jnp.abs(value) <= limit)))
 
-    def newton_step(value, values):
-        return -solve_whole(rows.square, values[rows.inside], value[rows.core], checked=False)
-
-    value, values, size, noise = evaluate(start)
-    weight = largest(values)
-
-    def body(state):
-        base, value, values, step, merit, fraction, count, _ = state
-        trial = base + fraction * step
-        trial_value, trial_values, size, noise = evaluate(trial)
-        trial_merit = merit_of(trial_value, weight)
-        inside = jnp.all((trial >= low) & (trial <= high))
-        arrived = jnp.all(jnp.abs(trial_value) <= close * size + noise) & inside
-        accepted = arrived | (inside & (trial_merit < (1 - DECREASE * fraction) * merit))
-
-        moved = trial, trial_value, trial_values, newton_step(trial_value, trial_values), trial_merit
-        # Not a branch: what it closes over must stay out of batches.
-        base, value, values, step, merit = (
-            jnp.where(accepted, a, b) for a, b in zip(moved, (base, value, values, step, merit), strict=True)
-        )
-        fraction = jnp.where(accepted, jnp.minimum(1.0, 4 * fraction), 0.5 * fraction)
-        return base, value, values, step, merit, fraction, count + 1, arrived
-
-    def going(state):
-        *_, step, _, fraction, count, done = state
-        return ~done & (fraction >= SHORTEST) & (count < NEWTON_LIMIT) & jnp.all(jnp.isfinite(step))
-
-    done = jnp.all(jnp.abs(value) <= close * size + noise)
-    step = newton_step(value, values)
-    state = (start, value, values, step, merit_of(value, weight), jnp.ones((), dtype), jnp.ones((), jnp.int32), done)
-    x, value, values, *_, evaluations, _ = jax.lax.while_loop(going, body, state)
-    size, noise = sizes_of_rows(x, values)
-    limit = enough * size + noise
-    method = jnp.where(evaluations > 1, METHODS.index("Newton"), 0).astype(jnp.int32)
-    return SparseFound(x, limit, jnp.all(jnp.abs(value) <= limit), method, evaluations)
+    none = jnp.zeros((rows.pattern.n_rows,), dtype)
+    found = newton(look, start, (none, jnp.asarray(jnp.inf, dtype), none, jnp.array(False)), NEWTON_LIMIT, SHORTEST)
+    *_, limit, holds = found.memory
+    method = jnp.where(found.count > 1, METHODS.index("Newton"), 0).astype(jnp.int32)
+    return SparseFound(found.x, limit, holds, method, found.count)

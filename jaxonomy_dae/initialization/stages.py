@@ -15,15 +15,18 @@ import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
 from scipy.sparse.csgraph import connected_components
 
+from ..linear.dense import least_squares
+from ..linear.newton import Tried, newton
 from ..lowering.plan import SystemPlan
 from ..lowering.remembered import remembered
 from ..structure.matching import maximum_matching
 from ..tolerances import close as close_within
+from .gauss_newton import DECREASE, SHORTEST
 from .rows import InitialRows
 from .sizes import Sizes, column_sizes
 
 LEAST_LEVEL = 2  # times that a constraint must have been differentiated for stages to be worth their compile time
-LIMIT = 40  # steps in a block
+LIMIT = 40  # looks, for each block
 
 
 @remembered
@@ -68,38 +71,29 @@ def solve_in_stages(
     row_of: Int[np.ndarray, " n"],
     block: Int[np.ndarray, " n"],
 ) -> Float[Array, " n"]:
-    """Levenberg–Marquardt steps in one block after the other, blocks before it held."""
-    n, last = len(block), int(block.max(initial=0))
+    """Newton steps in one block after the other, blocks before it held; least squares where a block is singular."""
+    last = int(block.max(initial=0))
     dtype = start.dtype
-    close = close_within(dtype)
+    close, number_of = close_within(dtype), jnp.asarray(block, jnp.int32)
 
-    def step(state):
-        trial, base, merit_base, damping, number, count = state
-        jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(trial)
-        value, jacobian = jax.lax.stop_gradient((value, jacobian))
+    def look(x, part, state):
+        number, least = state
+        jacobian, value = jax.lax.stop_gradient(jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(x))
         unit = column_sizes(value, jacobian, sizes)
         jacobian, value = (jacobian * unit[None, :])[row_of], value[row_of]
-        inside = jnp.asarray(block, jnp.int32) == number
         largest = jnp.max(jnp.abs(jacobian), axis=1)
-        weight = jnp.where(inside & (largest > 0), 1 / jnp.where(largest > 0, largest, 1), 0)
-        residual = weight * value
-        merit = jnp.max(jnp.abs(residual), initial=0.0)
-        accepted = jnp.isfinite(merit + jnp.sum(jacobian)) & ((merit < merit_base) | (merit_base < 0))
-        damping = jnp.where(accepted, 0.1 * damping, jnp.minimum(10 * damping, 1e6))
-        matrix = jnp.where(inside[None, :], weight[:, None] * jacobian, 0)
-        idle = jnp.where(inside, jnp.sqrt(damping), 1)
-        stacked = jnp.concatenate([matrix, jnp.diag(idle)])
-        q, r = jnp.linalg.qr(stacked)
-        move = jnp.where(inside, unit * jax.scipy.linalg.solve_triangular(r, q[:n].T @ -residual), 0)
-        base = jnp.where(accepted, trial, base)
-        done = (merit <= close) | (count >= LIMIT)
-        ahead = jnp.where(accepted & ~done & jnp.all(jnp.isfinite(move)), base + move, base)
-        # After a rejected step the Jacobian at the base is needed again.
-        merit_base = jnp.where(done | ~accepted, -1, merit)
-        moved = done.astype(jnp.int32)
-        return (ahead, base, merit_base, jnp.where(done, 1e-6, damping), number + moved, jnp.where(done, 0, count + 1))
+        residual = jnp.abs(value) / jnp.where(largest > 0, largest, 1)
+        # The first block that does not hold is the next one.
+        off = jnp.zeros((last + 1,), dtype).at[number_of].max(residual)
+        ahead = jnp.arange(last + 1, dtype=jnp.int32) >= number
+        wrong = ahead & ~(off <= close)
+        new = jnp.where(jnp.any(wrong), jnp.argmax(wrong).astype(jnp.int32), last + 1)
+        falls = (new > number) | (off[number] < (1 - DECREASE * part) * least)
+        inside = number_of == new
+        matrix = jnp.where(inside[:, None] & inside[None, :], jacobian, 0)
+        step = jnp.where(inside, -unit * least_squares(matrix, value), 0)
+        return Tried(falls, new > last, step, (new, off[jnp.minimum(new, last)]))
 
-    one = jnp.ones((), dtype)
-    state = (start, start, -one, 1e-6 * one, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
-    found = jax.lax.while_loop(lambda s: s[4] <= last, step, state)[1]
+    begin = jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, dtype)
+    found = newton(look, start, begin, LIMIT * (last + 1), SHORTEST).x
     return jnp.where(jnp.all(jnp.isfinite(found)), found, start)

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..judgement.scaling import equilibrated
+from ..linear.newton import Tried, newton
 from ..linear.sparse_least_squares import SparseLeastSquares
 from ..tolerances import ILL_CONDITIONED
 from .declared import start_guess
@@ -19,6 +20,11 @@ from .tables import Declared
 # Quantities up to which singular values are computed, in some 0.05 s at 300. Beyond, one sparse factorization solves to
 # five digits, which steps that are repeated until the equations hold do not show.
 FEW = 300
+MOST = 240  # looks at a point, shortened steps included; Newton's method takes ten
+
+_Seen = tuple[
+    np.ndarray, np.floating
+]  # units of the rows at the last accepted point, and the norm of the residuals there
 
 
 def initial_point(model: ReducedModel, declared: Declared) -> Point:
@@ -30,7 +36,7 @@ def initial_point(model: ReducedModel, declared: Declared) -> Point:
 
 
 @np.errstate(all="ignore")  # numbers that overflow end the search
-def consistent_point(extended: Extended, guess: Point, fixed: list[tuple[int, float]], iterations: int = 60) -> Point:
+def consistent_point(extended: Extended, guess: Point, fixed: list[tuple[int, float]]) -> Point:
     """A point near `guess` where the equations and the fixed starts hold: damped Gauss–Newton steps of least norm, in
     units in which all rows and columns of the Jacobian are alike.
 
@@ -44,36 +50,27 @@ def consistent_point(extended: Extended, guess: Point, fixed: list[tuple[int, fl
     )
     values = guess.values[:-1].copy()
 
-    def evaluate(values):
-        r, jacobian = residual_and_jacobian(extended, guess.at(values))
-        return np.concatenate([r, values[pins] - targets]), jacobian
-
-    r, jacobian = evaluate(values)
-    for _ in range(iterations):
+    def look(x: np.ndarray, part: np.ndarray, last: _Seen) -> Tried[np.ndarray, _Seen]:
+        rows, least = last
+        at = guess.at(np.concatenate([x, values[n:]]))
+        r, jacobian = residual_and_jacobian(extended, at)
+        r = np.concatenate([r, at.values[pins] - targets])
         full: sp.csr_array = sp.vstack([jacobian, pin_rows]).tocsr()[:, :n]
-        if not np.isfinite(full.data).all():
-            break
+        falls = np.isfinite(r).all() & (np.linalg.norm(rows * r) < (1 - 1e-4 * part) * least)
+        worse, nowhere = ~falls & (least < np.inf), np.full(n, np.nan)
+        if worse or not np.isfinite(full.data).all():
+            return Tried(falls, np.False_, nowhere, (rows, least))
         scaled, rows, columns = equilibrated(full)
         size = np.linalg.norm(rows * r)
-        if not np.isfinite(size) or size <= 1e-15 * (1 + np.abs(values[:n] / columns).max(initial=0.0)):
-            break
+        holds = size <= 1e-15 * (1 + np.abs(x / columns).max(initial=0.0))
         try:
             step = columns * _least_norm(scaled, -rows * r)
         except np.linalg.LinAlgError:
-            break
-        scale, accepted = 1.0, False
-        while scale > 1e-4:
-            trial = values.copy()
-            trial[:n] += scale * step
-            r_trial, jacobian_trial = evaluate(trial)
-            if np.isfinite(r_trial).all() and np.linalg.norm(rows * r_trial) < (1 - 1e-4 * scale) * size:
-                accepted = True
-                break
-            scale *= 0.5
-        if not accepted:
-            break
-        values, r, jacobian = trial, r_trial, jacobian_trial
-    return guess.at(values)
+            step = nowhere
+        return Tried(falls, holds, step, (rows, size))
+
+    found = newton(look, values[:n], (np.ones(()), np.float64(np.inf)), MOST, 1e-4)
+    return guess.at(np.concatenate([found.x, values[n:]]))
 
 
 def _least_norm(matrix: Any, right: np.ndarray) -> np.ndarray:

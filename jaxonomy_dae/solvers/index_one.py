@@ -9,6 +9,7 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Float
 
 from ..linear.choice import LinearAlgebra, choose
+from ..linear.newton import Tried, newton
 from .dae_term import FlatProblem
 
 SHORTEST = 1e-6  # of a Newton step: if not even this part brings the next one down, there is no way on from here
@@ -56,17 +57,13 @@ def _newton_step(
     y: Float[Array, " n"],
     start: Float[Array, " n"],
 ) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
-    """The Newton step at a point, with the matrix factored at y.
-
-    Large steps there and back would leave rounding errors in M y, so every step mends it.
-    """
+    """The Newton step at a point, with the matrix factored at y."""
     chosen, at_y, _, matrix = index_matrix(problem, linear, t, y)
     factors = chosen.factor(matrix)
 
     def step(v: Float[Array, " n"]) -> Float[Array, " n"]:
         right = at_y if v is y else problem.right(t, v)
-        b = algebraic_part(problem, right) + problem.mass.times(start - v)
-        return chosen.solve(factors, matrix, b)
+        return chosen.solve(factors, matrix, _off(problem, right, v, start))
 
     return step
 
@@ -81,50 +78,43 @@ def consistent_point(
     """Newton's method onto the algebraic equations from y, M y left alone: the point, and the size of the last step.
 
     Steps are shortened until the next one, with the same matrix, is shorter (the natural monotonicity test, Deuflhard
-    2004, section 3.3): far from a solution of exponentials, whole steps wander. Two steps at the end carry first and
-    second derivatives.
+    2004, section 3.3): far from a solution of exponentials, whole steps wander.
     """
     if not problem.mass.is_singular:
         return y, jnp.zeros((), y.dtype)
     frozen = jax.lax.stop_gradient
     still, t_still, y_still = problem.frozen(), frozen(t), frozen(y)
+    chosen = choose(linear, y.shape[0], problem.pattern, problem.mass)
     eps = float(jnp.finfo(y.dtype).eps)
 
-    def going(carry):
-        _, size, fraction, count = carry
-        return (size > 10 * eps) & (fraction >= SHORTEST) & (count < max_steps)
-
-    def body(carry):
-        v, _, fraction, count = carry
-        step = _newton_step(still, linear, t_still, v, y_still)
-        d = step(v)
+    def look(v, part, last):
+        factors, size = last
 
         def length(of):
             return jnp.max(jnp.abs(of) / (1 + jnp.abs(v)), initial=0.0)
 
-        size = length(d)
+        _, right, _, matrix = index_matrix(still, linear, t_still, v)
+        b = _off(still, right, v, y_still)
+        # The restricted monotonicity test (Deuflhard 2004, section 3.3): the step from here, by the last matrix, must
+        # be shorter by a quarter of the part of the last step that was taken.
+        falls = (size <= SURE) | (length(chosen.apply(factors, None, b)) <= (1 - part / 4) * size)
+        new = chosen.factor(matrix)
+        step = chosen.apply(new, None, b)
+        return Tried(falls, length(step) <= 10 * eps, step, (new, length(step)))
 
-        # The restricted monotonicity test (Deuflhard 2004, section 3.3): the next step must be shorter by a quarter of
-        # the part of this one that is taken.
-        def falls(fraction):
-            return (size <= SURE) | (length(step(v + fraction * d)) <= (1 - fraction / 4) * size)
+    none = chosen.empty(y.shape[0], y.dtype), jnp.asarray(jnp.inf, y.dtype)
+    found = newton(look, y_still, none, max_steps + 1, SHORTEST)
+    at = y + frozen(found.x - y_still)
+    step = _newton_step(problem, linear, t, at, y)
+    for _ in range(2):  # with derivatives, written out
+        at = at + step(at)
+    return at, found.memory[1]
 
-        def shorten(state):
-            return state[0] / 2, falls(state[0] / 2)
 
-        fraction = jnp.minimum(2 * fraction, 1)
-        fraction, _ = jax.lax.while_loop(lambda s: ~s[1] & (s[0] >= SHORTEST), shorten, (fraction, falls(fraction)))
-        return v + fraction * d, size, fraction, count + 1
-
-    begin = (y_still, jnp.asarray(jnp.inf, y.dtype), jnp.ones((), y.dtype), 0)
-    found, size, *_ = jax.lax.while_loop(going, body, begin)
-    found = y + frozen(found - y_still)
-    # The search above is not differentiated. From its root, one Newton step has the first derivative of the implicit
-    # function, and a second one the second derivative.
-    step = _newton_step(problem, linear, t, found, y)
-    for _ in range(2):
-        found = found + step(found)
-    return found, size
+def _off(problem: FlatProblem, right: Array, v: Array, start: Array) -> Float[Array, " n"]:
+    """The right side of a Newton step. Large steps there and back would leave rounding errors in M y, so every step
+    mends it."""
+    return algebraic_part(problem, right) + problem.mass.times(start - v)
 
 
 def algebraic_part(problem: FlatProblem, v: Float[Array, " n"]) -> Float[Array, " n"]:

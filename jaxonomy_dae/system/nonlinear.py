@@ -11,7 +11,7 @@ import abc
 import enum
 import functools
 from collections.abc import Sequence
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,12 @@ class AbstractBlock(abc.ABC, Generic[_P]):
         self.values = values
         self.planned = planned
         self.dtype = values.dtype
+
+    @property
+    def still(self) -> Self:
+        """The same blocks, not differentiated. Each is a new one: what values remember while a loop is traced must not
+        leave it."""
+        return type(self)(self.values.frozen(), self.planned)
 
     @property
     @abc.abstractmethod
@@ -103,14 +109,12 @@ class AbstractBlock(abc.ABC, Generic[_P]):
             inside = self.at(self.corrected(z))
             holds = self.holds(inside, ROUGH)
         else:
-            still, tolerated = type(self)(self.values.frozen(), self.planned), solved(self.dtype)
+            tolerated, batch = solved(self.dtype), () if self.whole else jnp.shape(z[0])
+            magnitudes = self.still.magnitudes(self.still.at(z))
             z, holds = find_root(
-                lambda z: still.holds(still.at(z), tolerated),
-                still.step,
-                self.corrected,
-                still.magnitudes(still.at(z)),
-                z,
-            )
+                lambda z: jnp.broadcast_to((still := self.still).holds(still.at(z), tolerated), batch),
+                lambda z: self.still.step(z), self.corrected, magnitudes, z, batch,
+            )  # fmt: skip
             inside = self.at(z)
         nan = jnp.full_like(inside.chunks[0], jnp.nan)
         return [jax.lax.select(holds, u, nan) for u in inside.chunks]

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from ..linear.dense import solve_dense
+from ..linear.newton import Tried
+from ..linear.newton import newton as search
 from ..linear.written_out import UNROLLED, solve
 from ..tolerances import NOISE, ZERO_WITHIN, spacing
 
@@ -57,43 +59,30 @@ def find_root(
     differentiable: Callable[[list[Any]], list[Any]],
     sizes: list[Any],
     z: list[Any],
+    batch: tuple[int, ...],
 ) -> tuple[list[Any], Any]:
     """Newton's method from z until all `holds`, one verdict for each of a batch of problems; and the verdicts.
 
     `stepped` gives the residuals and the step. A step is halved until the largest residual falls, relative to the
     `sizes` of their terms at the start: whole steps go back and forth between the branches of a law with a kink.
 
-    The search is not differentiated. Two more steps of the `differentiable` correction follow: by the implicit function
-    theorem the first carries first derivatives and the second one second derivatives.
+    The search is not differentiated; two steps of the `differentiable` correction follow, written out.
     """
+    z, sizes = jax.lax.stop_gradient((z, sizes))
 
-    def going(carry):
-        *_, found, count = carry
-        return ~jnp.all(found) & (count < NEWTON_STEPS)
-
-    def body(carry):
-        trial, z, step, part, least, found, count = carry
-        residuals, new_step = stepped(trial)
+    def look(z, part, least):
+        residuals, step = stepped(z)
         off = [jnp.abs(r) / jnp.where(s > 0, s, 1) for r, s in zip(residuals, sizes, strict=True)]
         largest = functools.reduce(jnp.maximum, off)
-        largest = jnp.max(largest) if jnp.ndim(found) < jnp.ndim(largest) else largest
+        largest = jnp.max(largest) if len(batch) < jnp.ndim(largest) else largest
         falls = (largest <= (1 - part / 4) * least) | (least <= SURE)
-        part = jnp.where(falls, jnp.minimum(2 * part, 1), part / 2)
-        least = jnp.where(falls, largest, least)
-        z = [jnp.where(falls, a, b) for a, b in zip(trial, z, strict=True)]
-        step = [jnp.where(falls, a, b) for a, b in zip(new_step, step, strict=True)]
-        trial = [jnp.where(found, t, a + part * d) for t, a, d in zip(trial, z, step, strict=True)]
-        return trial, z, step, part, least, holds(trial), count + 1
+        return Tried(falls, holds(z), step, largest)
 
-    z, sizes = jax.lax.stop_gradient((z, sizes))
-    found = holds(z)
-    one = jnp.ones(jnp.shape(found), z[0].dtype)
-    begin = z, z, [jnp.zeros_like(a) for a in z], one, jnp.inf * one, found, 0
-    z, *_, found, _ = jax.lax.while_loop(going, body, begin)
-    z = jax.lax.stop_gradient(z)
+    found = search(look, z, jnp.full(batch, jnp.inf, z[0].dtype), NEWTON_STEPS, batch=batch)
+    z = jax.lax.stop_gradient(found.x)
     for _ in range(2):
         z = differentiable(z)
-    return z, found
+    return z, found.holds
 
 
 def newton(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> list[Any]:
