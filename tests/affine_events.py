@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxonomy_dae.hybrid.control import EventControl
+from jaxonomy_dae.adjoint.ends import ending
+from jaxonomy_dae.hybrid.control import AtEvents
 from jaxonomy_dae.hybrid.facts import EventFacts
 from jaxonomy_dae.hybrid.problem import AbstractHybridProblem, HybridTerm
 from jaxonomy_dae.hybrid.solver import WithEvents
@@ -190,7 +191,7 @@ def run(numbers: Numbers, t1: Any, ts: Any, solver: Any, adjoint: Any) -> Ran:
         HybridTerm(problem), WithEvents(solver, MAX_EVENTS, MAX_EVENTS), t0, t1, 0.01 * t1,
         start(problem, t0, numbers.x, numbers.q, None, MAX_EVENTS, False), None,
         save=diffrax.SubSaveAt(ts=ts, fn=lambda t, y, args: (y.x, y.q)),
-        controller=EventControl(diffrax.PIDController(rtol=1e-10, atol=1e-10)),
+        controller=ending(diffrax.PIDController(rtol=1e-10, atol=1e-10), AtEvents()),
         adjoint=adjoint, max_steps=2000,
     )  # fmt: skip
     _, last = done.last

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool
 from ..aliases import Args, Controller, PyTree, Solver, State, Terms, Time, Times
 from ..private_names import FOR_LATE_TIMES, missing
 from .closure_conversion import as_traced
-from .wrapped_control import WrappedControl
+from .ends import End, ending
 
 
 def times_fit(t0: Time, t1: Time, ts: Times, controller: Controller) -> Bool[Array, ""] | bool:
@@ -57,7 +57,7 @@ def diffeqsolve(
     else:
         adjoint = _LateTimes(adjoint, save, jnp.where(t0 < t1, 1, -1))  # pyright: ignore[reportCallIssue]
     if dt0 is not None:
-        controller = _FirstStep(controller, dt0)  # pyright: ignore[reportCallIssue]
+        controller = ending(controller, FirstStep(dt0))
     elif isinstance(controller, diffrax.StepTo):
         controller = _StepTo(controller)  # pyright: ignore[reportCallIssue]
     return diffrax.diffeqsolve(
@@ -105,16 +105,16 @@ class _LateTimes(diffrax.AbstractAdjoint):
         )
 
 
-class _FirstStep(WrappedControl):
-    """Wraps a controller so that its first step has the size `dt0`."""
+class FirstStep(End):
+    """The first step has the size `dt0`."""
 
     dt0: Time
 
     def wrap(self, direction):
-        return dataclasses.replace(super().wrap(direction), dt0=self.dt0 * direction)
+        return FirstStep(self.dt0 * direction)
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self.controller.init(terms, t0, t1, y0, self.dt0, args, func, error_order)
+    def asked(self, dt0):
+        return self.dt0
 
 
 class _StepTo(diffrax.AbstractStepSizeController):

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from ..aliases import Args, Controller, Numeric, PyTree, Solver, State, Terms, Time
 from ..private_names import FROM_CONTROLLER
 from .closure_conversion import SolveProgram, any_member, as_traced
-from .wrapped_control import WrappedControl
+from .ends import AttemptedStep, End
 
 # PUSH and MOTION are parts of a component's scale, |y| + atol/rtol: its size, and what tolerances make of zero.
 # Components at rest are pushed by PUSH in the second run. A push of this size stands for an infinitesimal one; the
@@ -56,24 +56,6 @@ class Pushed(eqx.Module):
     next_y: Float[Array, " n"]
     next_state: PyTree
     allowed: Float[Array, ""]  # how long the step after the next one may be
-
-
-class AttemptedStep(eqx.Module):
-    """An attempted step of the first run.
-
-    - `t0`, `y0`, `t1`, `y1`: its ends; y1 is y0 if the step was rejected.
-    - `accepted`, `jump`: whether it was accepted, and whether the field jumps at its end.
-    - `start`, `end`: the step to take next.
-    """
-
-    t0: Time
-    t1: Time
-    y0: State
-    y1: State
-    accepted: Numeric
-    jump: Numeric
-    start: Time
-    end: Time
 
 
 class Resting(eqx.Module):
@@ -138,7 +120,7 @@ class Resting(eqx.Module):
 
     def restrained(self, step: AttemptedStep, pushed: Pushed) -> tuple[Array, Pushed]:
         """Returns (the end of the next step, the second run's state after `step`); begins a second run where a
-        component has come to rest."""
+        component has come to rest. `step.y1` is `step.y0` if the step was rejected."""
         resting, step, pushed = still((self, step, pushed))
         x0, x1, h = _moving(step.y0), _moving(step.y1), step.t1 - step.t0
         rests = resting._rests((x1 - x0) / jnp.where(h > 0, h, 1.0), x1)
@@ -265,38 +247,29 @@ def held_back(
     return dataclasses.replace(new, tnext=end), end < new.tnext, pushed
 
 
-class HeldBack(WrappedControl):
-    """Wraps a controller so that it resolves derivatives of components at rest, for all adjoints but the record of
-    `StoredAdjoint`, which does so by itself."""
+class HeldBack(End):
+    """Steps resolve derivatives of components at rest, for all adjoints but the record of `StoredAdjoint`, which sees
+    to it by itself. The state of this end is (the length of the run, the second run's state)."""
 
     terms: Terms
     solver: Solver
+    controller: Controller
 
-    def _resting(self, y, args, span) -> Resting:
+    def _resting(self, y: State, args: Args, span: Time) -> Resting:
         found = Resting.of(self.terms, self.solver, self.controller, y, args, span)
         assert found is not None
         return found
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """As `controller.init`, with the first step no longer than the second run allows."""
-        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return self.begun(t0, end, state, y0, args, t1 - t0)
-
-    def begun(self, t: Time, end: Time, state: Any, y: State, args: Args, span: Time) -> tuple[Any, Any]:
-        """(The end of the first step, the state of the controller), given those of the wrapped one."""
+    def first(self, t, end, y, args, span):
         resting = self._resting(y, args, span)
-        return _no_later(t, end, resting.first_end(t, end, y)), (state, span, resting.begin(t, y))
+        return _no_later(t, end, resting.first_end(t, end, y)), (span, resting.begin(t, y))
 
-    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
-        """As `controller.adapt_step_size`, with the next step no longer than the second run allows."""
-        state, span, pushed = controller_state
-        keep, start, end, jump, state, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1, args, y_error, error_order, state
-        )
-        after = jax.tree.map(lambda a, b: jnp.where(keep, b, a), y0, y1)
-        step = AttemptedStep(t0=t0, t1=t1, y0=y0, y1=after, accepted=keep, jump=jump, start=start, end=end)
-        allowed, pushed = self._resting(y0, args, span).restrained(step, pushed)
-        return keep, start, _no_later(start, end, allowed), jump, (state, span, pushed), result
+    def next(self, step, args, state):
+        span, pushed = state
+        after = jax.tree.map(lambda a, b: jnp.where(step.accepted, b, a), step.y0, step.y1)
+        tried = step.but(y1=after, result=None, states=None)
+        allowed, pushed = self._resting(step.y0, args, span).restrained(tried, pushed)
+        return step.but(end=_no_later(step.start, step.end, allowed)), (span, pushed)
 
 
 def _pattern(x: Array) -> Array:

@@ -18,8 +18,9 @@ from ..private_names import has_stored_adjoint, private
 from ..programs.members import batch_size
 from .appended import NOTED, apart, together
 from .closure_conversion import SolveProgram, as_traced, by_itself_or_batched, closure_convert, unless_waiting
+from .ends import AttemptedStep, Ending
 from .recorded_loop import solve
-from .resting import AttemptedStep, HeldBack, Resting
+from .resting import HeldBack, Resting
 from .reverse_step import state_saves
 
 LARGEST_RECORD = 2**25  # bytes; a solve whose record would be larger is left to `RecursiveCheckpointAdjoint`
@@ -165,7 +166,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         state = given["init_state"]
         span = given["t1"] - state.tprev
         if not (self.known or _is_random(terms)) and Resting.of(terms, solver, controller, state.y, args, span):
-            held = HeldBack(controller, terms, solver)  # pyright: ignore[reportCallIssue]
+            held = Ending(controller, (HeldBack(terms, solver, controller),))  # pyright: ignore[reportCallIssue]
             end, controlled = held.begun(state.tprev, state.tnext, state.controller_state, state.y, args, span)
             state = dataclasses.replace(state, tnext=end, controller_state=_arrays(controlled))
             given = given | dict(stepsize_controller=held, init_state=state)

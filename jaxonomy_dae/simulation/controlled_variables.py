@@ -4,8 +4,8 @@ A variable y(t, x) may hang on a state by a large factor: the pressure of a stif
 the state that its tolerance allows then show. Here |∂y/∂x|·|error of x| counts as an error of y beside rtol·|y| + atol.
 """
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,46 +14,40 @@ import numpy as np
 from jax import Array
 
 from ..adjoint.resting import still
-from ..adjoint.wrapped_control import WrappedControl
-from ..aliases import Args, Controller, Solver, State, Time, Tolerance
+from ..aliases import Args, Solver, State, Time, Tolerance
 from ..errors import ModelError
 from ..programs.staging import is_traced
 from ..solvers import BDF
 from ..solvers.drive import inner
+from ..solvers.step_control import StepControl
 from ..system.system import AcausalSystem
 
 
-class ControlledVariables(WrappedControl):
-    """Wraps a controller so that the error norm has entries for variables of the model, too.
+class Variables(eqx.Module):
+    """Variables of the model that stand beside the states in the norm of errors.
 
-    - `quantity`, `factor`: the variables, shape (m,) each; `extra`: their absolute tolerances, shape (m,).
+    - `quantity`, `factor`: the variables, shape (m,) each; `atol`: their absolute tolerances, shape (m,).
     """
 
     system: AcausalSystem
-    extra: Tolerance
+    atol: Tolerance
     quantity: tuple[int, ...] = eqx.field(static=True)
     factor: tuple[float, ...] = eqx.field(static=True)
 
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """As `controller.adapt_step_size`, of the state and the variables."""
-        own, given, here, there, y_, y1, error = still((self, args, t0, t1, y0, y1_candidate, y_error))
-        before, after = own._read(here, y_, given), own._read(there, y1, given)
+    def __call__(self, t0, t1, y0, y1, error, args):
+        """The variables before and after a step, and their errors, not differentiated."""
+        own, given, here, there, y0, y1, error = still((self, args, t0, t1, y0, y1, error))
         slopes = jax.jacrev(lambda x: own._read(there, x, given))(y1)
         # Without signs: error estimates of two states may have lost theirs, and must not cancel.
-        moved = jnp.abs(slopes) @ jnp.abs(error)
-        atol = jnp.concatenate([jnp.broadcast_to(own.controller.atol, y1.shape), own.extra])
-        controller = eqx.tree_at(lambda c: c.atol, self.controller, atol)
-        pairs: Any = ((y0, before), (y1_candidate, after), (y_error, moved))
-        joined = [jnp.concatenate(pair) for pair in pairs]
-        return controller.adapt_step_size(t0, t1, *joined[:2], args, joined[2], error_order, controller_state)
+        return own._read(here, y0, given), own._read(there, y1, given), jnp.abs(slopes) @ jnp.abs(error)
 
     def _read(self, t: Time, x: State, args: Args) -> Array:
         return self.system.at(t, args).quantities(x, np.array(self.quantity), np.array(self.factor))
 
 
 def with_variables(
-    system: AcausalSystem, controller: Controller, solver: Solver, names: Sequence[str], atol: Tolerance
-) -> Any:
+    system: AcausalSystem, controller: StepControl, solver: Solver, names: Sequence[str], atol: Tolerance
+) -> StepControl:
     """The controller, with the variables of these names under error control, too.
 
     **Raises:**
@@ -74,7 +68,8 @@ def with_variables(
     quantity, factor = quantity[read], factor[read]
     size = np.minimum(np.abs(factor) * _sizes(system)[quantity], 1.0)
     extra = atol * jnp.asarray(size, atol.dtype)
-    return ControlledVariables(controller, system, extra, tuple(quantity.tolist()), tuple(factor.tolist()))  # pyright: ignore[reportCallIssue]
+    beside = Variables(system, extra, tuple(quantity.tolist()), tuple(factor.tolist()))
+    return dataclasses.replace(controller, beside=beside)
 
 
 def _sizes(system: AcausalSystem) -> np.ndarray:

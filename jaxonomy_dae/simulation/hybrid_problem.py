@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,8 +10,7 @@ import numpy as np
 from jax import Array
 
 from ..adjoint.resting import still
-from ..aliases import Args, Controller, State, Time, Tolerance
-from ..hybrid.control import EventControl
+from ..aliases import Args, State, Time, Tolerance
 from ..hybrid.facts import EventFacts
 from ..hybrid.first_order import constant_once
 from ..hybrid.problem import AbstractHybridProblem
@@ -211,11 +209,3 @@ def without_clocked(system: AcausalSystem, q: Array) -> Array:
     if not len(chosen):
         return q
     return q.at[chosen].set(jnp.asarray(system.plan.flat.parameters.starts_of(events.discrete[chosen]), q.dtype))
-
-
-def with_event_control(controller: Controller) -> Controller:
-    """Wraps the controller so that steps end at events. A controller that clips steps at jumps of inputs stays
-    outermost."""
-    if isinstance(controller, diffrax.ClipStepSizeController):
-        return eqx.tree_at(lambda c: c.controller, controller, with_event_control(controller.controller))
-    return EventControl(controller)  # pyright: ignore[reportCallIssue]

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..adjoint.ends import ending
 from ..aliases import Args, Controller, Inputs, PyTree, Result, Solver, State, Time, Times
-from ..hybrid.control import ENDED
+from ..hybrid.control import ENDED, AtEvents
 from ..hybrid.problem import HybridState, HybridTerm
 from ..hybrid.solver import CLASH, WithEvents
 from ..hybrid.start import start
@@ -26,7 +27,7 @@ from ..system.system import AcausalSystem
 from .arguments import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .from_state import from_state
-from .hybrid_problem import problem_for, with_event_control, without_clocked
+from .hybrid_problem import problem_for, without_clocked
 from .preparation import SAVED_ITERATIONS, largest_tolerance, prepared, term_of
 from .saved_state import Memory, SavedState, same_time
 from .step_sizes import first_step
@@ -142,7 +143,7 @@ def run(
         clashes = y0.stuck < -1
         goes_on = admitted & (y0.ended == 0) & ~clashes
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events, options.room, options.save_events)
-        controller = with_event_control(controller)
+        controller = ending(controller, AtEvents())
         saved_of = _with_events
     save = diffrax.SubSaveAt(t0=True, steps=True, fn=saved_of) if ts is None else diffrax.SubSaveAt(ts=ts, fn=saved_of)
     done = integrate(

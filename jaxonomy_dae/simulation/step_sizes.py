@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..adjoint.ends import ending
 from ..adjoint.resting import still
 from ..aliases import Args, Controller, Numeric, Solver, State, Time, Times, Tolerance
 from ..errors import ModelError
@@ -19,7 +20,7 @@ from ..system.inputs import StepEnds
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .controlled_variables import with_variables
-from .wave_control import WaveControl
+from .wave_control import AtWaves
 
 
 def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Tolerance:
@@ -48,7 +49,7 @@ def controller_for(
     # The ends of steps are constants of differentiation. Where their values are known, nothing is compiled for them.
     known = eqx.tree_at(lambda s: s.parameters, system, still(system.parameters))
     at = SystemAt(system.plan, known.numbers, (), 0.0, {}, system.typical_sizes)
-    return WaveControl(controller, *at.waves(is_traced(system.parameters)))  # pyright: ignore[reportCallIssue]
+    return ending(controller, AtWaves(*at.waves(is_traced(system.parameters))))
 
 
 def clipped(controller: Controller, jump_ts: Times, ends: StepEnds) -> Controller:
@@ -61,8 +62,7 @@ def clipped(controller: Controller, jump_ts: Times, ends: StepEnds) -> Controlle
     if not jumps and not ends.kinks:
         return controller
     times = [joined(ts) if ts else None for ts in (jumps, ends.kinks)]
-    lengths = ConstantLengths(controller)  # pyright: ignore[reportCallIssue]
-    return diffrax.ClipStepSizeController(lengths, step_ts=times[1], jump_ts=times[0])
+    return diffrax.ClipStepSizeController(ending(controller, ConstantLengths()), step_ts=times[1], jump_ts=times[0])
 
 
 def first_step(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..adjoint.wrapped_control import WrappedControl
+from ..adjoint.ends import End
 from ..aliases import Time
 
 QUARTER = 0.5 * jnp.pi  # of a turn, radians
@@ -20,19 +20,16 @@ HERE = 1e-6  # of a quarter: a step that ends at an extreme, or so close to it, 
 ROUNDINGS = 16  # of the angle: as far from an extreme as times are known, where many periods have passed
 
 
-class WaveControl(WrappedControl):
-    """Wraps a controller for inputs that are waves sin(ωt + φ): steps are at most a quarter of the shortest period, and
-    long steps end where a wave is zero, one or minus one. Times are constants of differentiation, as step sizes are."""
+class AtWaves(End):
+    """For inputs that are waves sin(ωt + φ): steps are at most a quarter of the shortest period, and long steps end
+    where a wave is zero, one or minus one. Times are constants of differentiation, as step sizes are."""
 
     frequency: Float[Array, " waves"]
     phase: Float[Array, " waves"]
 
-    def first_end(self, start: Time, end: Time) -> Time:
-        return self.next_end(start, end)
-
-    def next_end(self, start: Time, end: Time) -> Time:
-        """The end of a step that the wrapped controller would take from `start` to `end`, moved forwards so that steps
-        end where a wave has turned by whole quarters."""
+    def moved(self, start: Time, end: Time) -> Time:
+        """The end of a step from `start` to `end`, moved so that steps end where a wave has turned by whole
+        quarters."""
         begin, step, frequency, phase = lax.stop_gradient((start, end - start, self.frequency, self.phase))
         quarter = QUARTER / jnp.abs(frequency)  # infinite for what does not turn
         bounded = jnp.minimum(step, jnp.min(quarter))

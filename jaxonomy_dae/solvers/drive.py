@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..adjoint.ends import Ending
 from ..adjoint.late_times import diffeqsolve, times_fit
 from ..adjoint.resting import HeldBack, Resting
 from ..adjoint.stored_adjoint import StoredAdjoint
@@ -76,7 +77,7 @@ def integrate(
     """Integrates; returns the values asked for, the last accepted point, and counts, Jacobians included."""
     # `StoredAdjoint` holds steps back by itself, where it is differentiated.
     if not isinstance(adjoint, StoredAdjoint) and Resting.of(term, solver, controller, y0, args, t1 - t0):
-        controller = HeldBack(controller, term, solver)  # pyright: ignore[reportCallIssue]
+        controller = Ending(controller, (HeldBack(term, solver, controller),))  # pyright: ignore[reportCallIssue]
     fits = times_fit(t0, t1, save.ts, controller)
     if checked and fits is not True:
         t1 = eqx.error_if(t1, jnp.logical_not(fits), TIMES)

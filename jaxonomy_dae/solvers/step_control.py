@@ -1,15 +1,17 @@
 """Step sizes: the first one, what follows a step, and the end when nothing helps."""
 
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax import Array
 
-from ..adjoint.wrapped_control import WrappedControl
-from ..aliases import Numeric, State, Time, Tolerance
+from ..adjoint.ends import End
+from ..aliases import Args, Numeric, State, Time, Tolerance
 
 SAFETY = 0.9  # of the step that would just meet the tolerance (Hairer, Nørsett & Wanner 1993, II.4)
 # In tolerances: the first step is chosen as if everything moved by as much in the problem's own time. Motion below the
@@ -45,6 +47,17 @@ def tolerance_like(atol: Tolerance, y: State) -> Tolerance:
     return jax.tree.map(lambda _: atol, y)
 
 
+class Beside(Protocol):
+    """What has errors beside the states: see `StepControl`."""
+
+    @property
+    def atol(self) -> Array: ...
+
+    def __call__(
+        self, t0: Time, t1: Time, y0: State, y1: State, error: State, args: Args, /
+    ) -> tuple[Array, Array, Array]: ...
+
+
 class StepControl(diffrax.AbstractAdaptiveStepSizeController):
     """Step sizes from tolerances of the local error.
 
@@ -59,6 +72,9 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
     - `norm`: of scaled errors; root mean square by default.
     - `steered`: for `BDF`.
     - `dtmax`: the longest step.
+    - `beside`: what else has errors: a function of a step (t0, t1, y0, y1, error, args) that returns further values
+        before and after it and their errors, all of shape (m,), and has their absolute tolerances as `atol`. For states
+        that are one array.
     """
 
     rtol: Tolerance
@@ -66,6 +82,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
     norm: Callable[[Numeric], Numeric] = optx.rms_norm
     steered: bool = eqx.field(static=True, default=False)
     dtmax: Time = None
+    beside: Beside | None = None
 
     def wrap(self, direction):
         return self
@@ -118,6 +135,11 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
             return e / (atol + jnp.maximum(jnp.abs(a), jnp.abs(b)) * self.rtol)
 
         atol = tolerance_like(self.atol, y0)
+        if self.beside is not None:
+            more = self.beside(t0, t1, y0, y1_candidate, y_error, args)
+            atol = jnp.concatenate([jnp.broadcast_to(atol, y0.shape), self.beside.atol])
+            pairs: Any = zip((y0, y1_candidate, y_error), more, strict=True)
+            y0, y1_candidate, y_error = (jnp.concatenate(pair) for pair in pairs)
         norm = jax.lax.stop_gradient(self.norm(jax.tree.map(scaled, y0, y1_candidate, y_error, atol)))
         norm = jnp.where(jnp.isfinite(norm), norm, jnp.inf)
         keep = norm < 1
@@ -140,8 +162,11 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         return keep, start, start + dt, False, tries, result
 
 
-class ConstantLengths(WrappedControl):
-    """Wraps a controller so that the lengths of steps after the first one are constant under differentiation."""
+class ConstantLengths(End):
+    """The lengths of steps after the first one are constant under differentiation."""
 
-    def next_end(self, start: Time, end: Time) -> Time:
+    def first(self, t, end, y, args, span):
+        return end, ()
+
+    def moved(self, start: Time, end: Time) -> Time:
         return start + jax.lax.stop_gradient(end - start)

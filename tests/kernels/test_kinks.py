@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxonomy_dae.adjoint.ends import ending
 from jaxonomy_dae.errors import ModelError
-from jaxonomy_dae.hybrid.control import EventControl
+from jaxonomy_dae.hybrid.control import AtEvents
 from jaxonomy_dae.hybrid.facts import EventFacts
 from jaxonomy_dae.hybrid.first_order import differentiable_once
 from jaxonomy_dae.hybrid.problem import AbstractHybridProblem, HybridTerm
@@ -66,7 +67,7 @@ def final(p, only_kinks):
         HybridTerm(problem), WithEvents(diffrax.Tsit5(), 64), t0, t1, 0.1,
         start(problem, t0, jnp.array([0.0, 1.0]), jnp.zeros(1), None, 0, False), None,
         save=diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.x), adjoint=StoredAdjoint(), max_steps=1000,
-        controller=EventControl(diffrax.PIDController(rtol=1e-10, atol=1e-10)),
+        controller=ending(diffrax.PIDController(rtol=1e-10, atol=1e-10), AtEvents()),
     )  # fmt: skip
     return done.last[1].x[0], done.last[1].q[0]
 

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.simulation.wave_control import WaveControl
+from jaxonomy_dae.adjoint.ends import ending
+from jaxonomy_dae.simulation.wave_control import AtWaves
 
 
 class Wishing(diffrax.AbstractAdaptiveStepSizeController):
@@ -29,11 +30,11 @@ class Wishing(diffrax.AbstractAdaptiveStepSizeController):
 
 def ends(length, frequency, phase, n, t0=0.0):
     """The ends of n steps."""
-    control = WaveControl(Wishing(length), jnp.array(frequency), jnp.array(phase))
-    first, _ = control.init(None, jnp.array(t0), 1e9, None, None, None, None, 5)
+    control = ending(Wishing(length), AtWaves(jnp.array(frequency), jnp.array(phase)))
+    first, state = control.init(None, jnp.array(t0), 1e9, None, None, None, None, 5)
 
     def step(end, _):
-        _, _, following, *_ = control.adapt_step_size(t0, end, None, None, None, None, 5, None)
+        _, _, following, *_ = control.adapt_step_size(t0, end, None, None, None, None, 5, state)
         return following, end
 
     return np.asarray(jax.lax.scan(step, first, length=n)[1])
@@ -85,7 +86,7 @@ def test_what_does_not_turn_bounds_nothing():
 
 def test_times_are_constants_of_differentiation():
     def last(frequency):
-        control = WaveControl(Wishing(100.0), frequency[None], jnp.array([0.3]))
+        control = ending(Wishing(100.0), AtWaves(frequency[None], jnp.array([0.3])))
         return control.init(None, jnp.array(0.0), 1e9, None, None, None, None, 5)[0]
 
     value, slope = jax.value_and_grad(last)(jnp.array(3.0))
