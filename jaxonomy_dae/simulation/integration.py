@@ -1,7 +1,7 @@
 """One run of a compiled system: a consistent start, the integration, and saved states on the constraints."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..adjoint.ends import ending
-from ..aliases import Args, Controller, Inputs, PyTree, Result, Solver, State, Time, Times
+from ..aliases import Args, Controller, Inputs, PyTree, Result, Solver, State, Terms, Time, Times
 from ..hybrid.control import ENDED, AtEvents
 from ..hybrid.problem import HybridState, HybridTerm
 from ..hybrid.solver import CLASH, WithEvents
@@ -20,14 +20,14 @@ from ..initialization.initialize import InitialPoint, initialize, is_consistent
 from ..initialization.ladder import Found
 from ..programs.cache import compiled
 from ..programs.platform import precisely
-from ..solvers.drive import integrate, is_implicit, right_between_steps
+from ..solvers.drive import Run, integrate, is_implicit, right_between_steps
 from ..solvers.rows import not_a_number, padded
 from ..solvers.switching import STIFF, Watch
 from ..system.system import AcausalSystem
 from .arguments import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .from_state import from_state
-from .hybrid_problem import problem_for, without_clocked
+from .hybrid_problem import SystemProblem, problem_for, without_clocked
 from .preparation import SAVED_ITERATIONS, largest_tolerance, prepared, term_of
 from .saved_state import Memory, SavedState, same_time
 from .step_sizes import first_step
@@ -86,6 +86,54 @@ class Outcome(eqx.Module):
         return {name: int(value) for name, value in self.stats.items() if jnp.ndim(value) == 0}
 
 
+class _Start(NamedTuple):
+    """Where a run begins.
+
+    - `system`: with its bounds looked at, and with the discrete values of another run if it goes on from there; what
+        that run left of its events is `resumed`.
+    - `found`: the initial point; `admitted`: whether what is given can be run.
+    """
+
+    system: AcausalSystem
+    found: InitialPoint
+    resumed: Any
+    admitted: Array
+
+
+class _Parts(NamedTuple):
+    """What is integrated, and by what.
+
+    - `problem`: with events, else None; `y0`: the state of the integration; `saved`: what is saved of it.
+    - `admitted`, `consistent`, `goes_on`: whether the run is possible, begins at a consistent point, and takes steps.
+    - `clashes`: whether two events of the first instant contradict each other; None without events.
+    """
+
+    term: Terms
+    solver: Solver
+    controller: Controller
+    dt0: Time
+    problem: SystemProblem | None
+    y0: State
+    saved: Callable[..., State]
+    admitted: Array
+    consistent: Array
+    goes_on: Array
+    clashes: Array | None
+
+
+class _Rows(NamedTuple):
+    """The saved rows: times, states, discrete values and what another run needs to go on, in all of which the rows
+    that were not reached are not `filled`; the last point, and whether every row is finite and on the constraints."""
+
+    ts: Times
+    x: Array
+    discrete: Array | None
+    memory: Memory | None
+    filled: Array
+    last: tuple[Any, Any]
+    okay: Array
+
+
 @precisely
 def run(
     given: Given,
@@ -94,12 +142,46 @@ def run(
     checked: bool = False,
     begun: Found | InitialPoint | None = None,
 ) -> Outcome:
-    """Integrates what is given; `watch` is for Tsit5. With `checked`, an inconsistent start
-    and times that do not fit are errors while running. `begun` is what
-    is known of the start: what `search_outside` found, or all of it."""
-    system, t0, t1, ts = given.system, given.t0, given.t1, given.ts
-    inputs, initial = given.inputs, given.initial
-    admitted = are_admitted(system, inputs, t0, t1)
+    """Integrates what is given; `watch` is for Tsit5. With `checked`, an inconsistent start and times that do not fit
+    are errors while running. `begun` is what is known of the start: what `search_outside` found, or all of it."""
+    begin = _started(given, checked, begun)
+    parts = _parts(given, options, watch, begin)
+    ts, fn = given.ts, parts.saved
+    done = integrate(
+        parts.term, parts.solver, given.t0, given.t1, parts.dt0, parts.y0, given.inputs,
+        save=diffrax.SubSaveAt(t0=True, steps=True, fn=fn) if ts is None else diffrax.SubSaveAt(ts=ts, fn=fn),
+        controller=parts.controller, adjoint=options.adjoint, max_steps=options.max_steps,
+        progress=options.progress, checked=checked, goes_on=parts.goes_on,
+    )  # fmt: skip
+    rows = _rows(given, begin, parts, done)
+    consistent = parts.consistent & parts.admitted
+    # What is not a number here has derivatives that are not, so that a loss over failed rows cannot seem to have a
+    # gradient.
+    x = not_a_number(rows.x, rows.filled & consistent, begin.found.x, begin.system, given.inputs)
+    discrete = rows.discrete
+    if discrete is not None:
+        discrete = jnp.where((rows.filled & consistent)[:, None], discrete, jnp.nan)
+    end: Any = done.last[1]
+    with_events = parts.problem is not None
+    return Outcome(
+        found=begin.found._replace(jacobian=None),
+        ts=rows.ts,
+        x=x,
+        last=rows.last,
+        stats=done.stats,
+        result=_result(given, parts, done.result, rows, consistent),
+        is_stiff=consistent & (done.result == STIFF) if watch is not None else jnp.array(False),
+        discrete=discrete,
+        events=EventLog.of(end) if with_events else None,
+        held=end.q if with_events else None,
+        memory=rows.memory,
+    )
+
+
+def _started(given: Given, checked: bool, begun: Found | InitialPoint | None) -> _Start:
+    """Finds the initial point, unless it is known."""
+    system, t0, inputs, initial = given.system, given.t0, given.inputs, given.initial
+    admitted = are_admitted(system, inputs, t0, given.t1)
     system = system.settled()  # so that bounds are looked at once, and not whenever equations are
     if checked:
         system = eqx.tree_at(
@@ -118,50 +200,62 @@ def run(
         found = from_state(system, t0, inputs, initial)
     if checked:
         found = check(system, found, t0, inputs, initial, running=True, throw=True)
-    x0, controller = found.x, options.controller
-    implicit = is_implicit(options.solver)
-    chosen = options.solver if ts is None else right_between_steps(options.solver)
+    return _Start(system, found, resumed, admitted)
+
+
+def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -> _Parts:
+    """Prepares the solver, and what watches over events."""
+    system, t0, t1, inputs, controller = begin.system, given.t0, given.t1, given.inputs, options.controller
+    x0, admitted, consistent = begin.found.x, begin.admitted, is_consistent(begin.found)
+    implicit, prescribed = is_implicit(options.solver), isinstance(controller, diffrax.StepTo)
+    chosen = options.solver if given.ts is None else right_between_steps(options.solver)
     tolerance = largest_tolerance(system, controller)
-    judged = not isinstance(controller, diffrax.StepTo)
-    solver = prepared(system, chosen, implicit, watch, tolerance, judged)
+    solver = prepared(system, chosen, implicit, watch, tolerance, judged=not prescribed)
     term = term_of(system, implicit, forwards=isinstance(options.adjoint, diffrax.ForwardMode))
     # With an implicit solver the controller chooses the first step itself: `dt0=None`.
-    own_start = implicit and not isinstance(controller, diffrax.StepTo)
+    own_start = implicit and not prescribed
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
-    y0: State = x0
-    goes_on: Any = admitted
-    clashes: Any = None
-    saved_of: Callable = _whole
-    consistent = is_consistent(found)
-    if system.plan.events is not None:
-        problem = problem_for(system, t0, t1, implicit, watch, tolerance)
-        if system.plan.held is not None:
-            admitted = jnp.all(jnp.isfinite(problem.admitted(t0, x0, system.discrete_values, inputs)))
-            consistent = consistent & admitted
-        q0 = system.discrete_values if resumed is None else without_clocked(system, system.discrete_values)
-        y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
-        clashes = y0.stuck < -1
-        goes_on = admitted & (y0.ended == 0) & ~clashes
-        term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events, options.room, options.save_events)
-        controller = ending(controller, AtEvents())
-        saved_of = _with_events
-    save = diffrax.SubSaveAt(t0=True, steps=True, fn=saved_of) if ts is None else diffrax.SubSaveAt(ts=ts, fn=saved_of)
-    done = integrate(
-        term, solver, t0, t1, dt0, y0, inputs,
-        save=save, controller=controller, adjoint=options.adjoint, max_steps=options.max_steps,
-        progress=options.progress, checked=checked, goes_on=goes_on,
-    )  # fmt: skip
+    if system.plan.events is None:
+        return _Parts(
+            term=term, solver=solver, controller=controller, dt0=dt0, problem=None, y0=x0, saved=_whole,
+            admitted=admitted, consistent=consistent, goes_on=admitted, clashes=None,
+        )  # fmt: skip
+    problem = problem_for(system, t0, t1, implicit, watch, tolerance)
+    if system.plan.held is not None:
+        admitted = admitted & jnp.all(jnp.isfinite(problem.admitted(t0, x0, system.discrete_values, inputs)))
+        consistent = consistent & admitted
+    resumed, q0 = begin.resumed, system.discrete_values
+    q0 = q0 if resumed is None else without_clocked(system, q0)
+    y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
+    clashes = y0.stuck < -1
+    return _Parts(
+        term=HybridTerm(problem),
+        solver=WithEvents(chosen, options.max_events, options.room, options.save_events),
+        controller=ending(controller, AtEvents()),
+        dt0=dt0,
+        problem=problem,
+        y0=y0,
+        saved=_with_events,
+        admitted=admitted,
+        consistent=consistent,
+        goes_on=admitted & (y0.ended == 0) & ~clashes,
+        clashes=clashes,
+    )
+
+
+def _rows(given: Given, begin: _Start, parts: _Parts, done: Run) -> _Rows:
+    """The rows that were saved, on the constraints."""
+    system, ts, t0, x0 = begin.system, given.ts, given.t0, begin.found.x
     saved, x, last = done.ts, done.ys, done.last
-    discrete, events, held, memory = None, None, None, None
-    if system.plan.events is not None:
+    discrete = memory = None
+    if parts.problem is not None:
         x, discrete, marks = x
-        events = EventLog.of(last[1])
-        memory = Memory.of(problem, saved, marks, last[1].size)
-        held, last = last[1].q, (last[0], last[1].x)
+        end: Any = last[1]
+        memory, last = Memory.of(parts.problem, saved, marks, end.size), (last[0], end.x)
     x = jnp.asarray(x)
     filled = jnp.isfinite(saved)
-    if system.plan.events is not None and ts is not None:
-        filled = filled & (goes_on | (ts == t0))
+    if parts.problem is not None and ts is not None:
+        filled = filled & (parts.goes_on | (ts == t0))
     okay = diffrax.is_okay(done.result)
     safe, times = jnp.where(filled[:, None], x, x0), jnp.where(filled, saved, t0)
     holds = finite = jnp.all(jnp.isfinite(safe), axis=1)
@@ -170,7 +264,7 @@ def run(
         # below.
         def projected_onto(t, y, q):
             now = system if q is None else system.holding(q)
-            return now.project_fully(t, y, inputs, SAVED_ITERATIONS)
+            return now.project_fully(t, y, given.inputs, SAVED_ITERATIONS)
 
         values = None if discrete is None else jnp.where(filled[:, None], discrete, system.discrete_values)
         projected = jax.vmap(projected_onto)(times, safe, values)
@@ -181,43 +275,26 @@ def run(
     okay, filled = okay & right, filled & (right | (jnp.arange(len(filled)) < k))
     k = jnp.where(finite[k], k, jnp.maximum(k - 1, 0))
     last = jax.tree.map(lambda a, b: jnp.where(right, a, b), last, (times[k], safe[k]))
-    if ts is None:
-        steps = done.stats["num_accepted_steps"]
-        if discrete is not None and memory is not None:
-            _, discrete = padded(saved, discrete, steps)
-            memory = memory.padded(saved, steps)
-        saved, x = padded(saved, x, steps)
-        filled = filled | okay
-    else:
-        saved = ts
-    # What is not a number here has derivatives that are not, so that a loss over failed rows cannot seem to have a
-    # gradient.
-    consistent = consistent & admitted
-    x = not_a_number(x, filled & consistent, x0, system, inputs)
+    if ts is not None:
+        return _Rows(ts, x, discrete, memory, filled, last, okay)
+    steps = done.stats["num_accepted_steps"]
+    if discrete is not None and memory is not None:
+        _, discrete = padded(saved, discrete, steps)
+        memory = memory.padded(saved, steps)
+    saved, x = padded(saved, x, steps)
+    return _Rows(saved, x, discrete, memory, filled | okay, last, okay)
+
+
+def _result(given: Given, parts: _Parts, code: Result, rows: _Rows, consistent: Array) -> Result:
+    """The code of the run: Diffrax', unless rows, events, the start or what is given are at fault."""
     failure: Result = diffrax.RESULTS.nonlinear_divergence
-    result = diffrax.RESULTS.where(okay | ~diffrax.is_okay(done.result), done.result, failure)
-    if system.plan.events is not None:
-        result = diffrax.RESULTS.where(okay & ~goes_on, ENDED, result)
-        result = diffrax.RESULTS.where(clashes, CLASH, result)
+    result = diffrax.RESULTS.where(rows.okay | ~diffrax.is_okay(code), code, failure)
+    if parts.clashes is not None:
+        result = diffrax.RESULTS.where(rows.okay & ~parts.goes_on, ENDED, result)
+        result = diffrax.RESULTS.where(parts.clashes, CLASH, result)
     result = diffrax.RESULTS.where(consistent, result, failure)
-    looked_at = diffrax.is_okay(result) | inputs_are_finite(inputs, last[0], t1)
-    result = diffrax.RESULTS.where(admitted & looked_at, result, NOT_ADMITTED)
-    stiff = consistent & (done.result == STIFF) if watch is not None else jnp.array(False)
-    if discrete is not None:
-        discrete = jnp.where((filled & consistent)[:, None], discrete, jnp.nan)
-    return Outcome(
-        found=found._replace(jacobian=None),
-        ts=saved,
-        x=x,
-        last=last,
-        stats=done.stats,
-        result=result,
-        is_stiff=stiff,
-        discrete=discrete,
-        events=events,
-        held=held,
-        memory=memory,
-    )
+    looked_at = diffrax.is_okay(result) | inputs_are_finite(given.inputs, rows.last[0], given.t1)
+    return diffrax.RESULTS.where(parts.admitted & looked_at, result, NOT_ADMITTED)
 
 
 run_compiled = compiled(run)
