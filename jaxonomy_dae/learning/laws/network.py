@@ -4,38 +4,52 @@ Networks see and return numbers of order one; a law multiplies by what its input
 are settings, no weights: no training moves them.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ...errors import ModelError
+from ...errors import ModelError, whole_number
+
+if TYPE_CHECKING:
+    Sizes: TypeAlias = float | Sequence[float] | np.ndarray  # one for all, or one for each
+else:
+    Sizes = object  # others are refused by `sizes`, which says what was given
 
 
-def tanh_network(inputs: int, outputs: int, width: int, depth: int, key: PRNGKeyArray) -> eqx.nn.MLP:
-    """inputs → width → … → outputs with `depth` hidden layers of tanh: smooth, and bounded for given weights."""
+def tanh_network(law: str, inputs: int, outputs: int, width: int, depth: int, key: PRNGKeyArray) -> eqx.nn.MLP:
+    """inputs → width → … → outputs with `depth` hidden layers of tanh: smooth, and bounded for given weights. Errors
+    name the `law`."""
+    width = whole_number(width, f"{law}: width")
     return eqx.nn.MLP(inputs, outputs, width, depth, jnp.tanh, key=key)
 
 
-def sizes(given: Any, count: int, what: str) -> tuple[float, ...]:
+def sizes(given: Sizes, count: int, what: str) -> tuple[float, ...]:
     """The typical sizes of `count` values, from one number for all or one for each.
 
     **Raises:**
 
     - `ModelError` for another count, and for sizes that are not positive.
     """
+    values = each(given, count)
+    if values is None or not (np.isfinite(values) & (values > 0)).all():
+        raise ModelError(f"{what} is a typical size > 0, or one for each of {count}; got {given!r}")
+    return tuple(values.tolist())
+
+
+def each(given: Sizes, count: int) -> Float[np.ndarray, " count"] | None:
+    """One number for each of `count`, from one for all or one for each; None if it is neither."""
     try:
         values = np.asarray(given, float)
     except (TypeError, ValueError):
-        values = np.zeros(0)
-    if values.shape not in ((), (count,)) or not (np.isfinite(values) & (values > 0)).all():
-        raise ModelError(f"{what} is a typical size > 0, or one for each of {count}; got {given!r}")
-    return tuple(np.broadcast_to(values, (count,)).tolist())
+        return None
+    return np.broadcast_to(values, (count,)) if values.shape in ((), (count,)) else None
 
 
-def typical(given: Any, what: str) -> float:
+def typical(given: Sizes, what: str) -> float:
     """One typical size."""
     return sizes(given, 1, what)[0]
 
