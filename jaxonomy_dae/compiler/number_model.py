@@ -147,7 +147,7 @@ class ModelNumbers:
         for i in self.instances:
             above = [""] if i.parent is None else [f"{paths[k]}." for k in i.parent.number.tolist()]
             name = i.component.name
-            labels = [""] if i.array is None else [i.array.label(k) for k in range(i.array.size)]
+            labels = [""] if i.array is None else i.array.labels()
             own = [f"{p}{name}{label}" for p in above for label in labels]
             for k, path in zip(i.number.tolist(), own, strict=True):
                 paths[k] = path

@@ -14,6 +14,7 @@ from ..diagnosis.wording import itemised
 from ..errors import StructuralError
 from ..model.quantities import ReducedModel
 from ..model.tables import provenance_of
+from ..structure.integers import distinct
 from ..structure.matching import maximum_matching
 from .select_states import StateSelection
 
@@ -98,10 +99,10 @@ def _nothing_left(model: ReducedModel, equations: np.ndarray) -> str:
 def _levels(block: np.ndarray, needs: np.ndarray, n_blocks: int) -> np.ndarray:
     """The length of the longest chain of blocks below each block."""
     outside = block != needs
-    pairs = np.unique(np.stack([needs[outside], block[outside]], axis=1), axis=0)
-    waiting = np.bincount(pairs[:, 1], minlength=n_blocks)
-    start = np.concatenate([[0], np.cumsum(np.bincount(pairs[:, 0], minlength=n_blocks))]).tolist()
-    followers = pairs[:, 1].tolist()
+    first, second = np.divmod(distinct(needs[outside] * np.int64(n_blocks) + block[outside]), max(n_blocks, 1))
+    waiting = np.bincount(second, minlength=n_blocks)
+    start = np.concatenate([[0], np.cumsum(np.bincount(first, minlength=n_blocks))]).tolist()
+    followers = second.tolist()
     level = [0] * n_blocks
     waiting_list = waiting.tolist()
     ready = np.flatnonzero(waiting == 0).tolist()

@@ -100,8 +100,7 @@ def _loose_ports(flat: FlatModel) -> tuple[str, ...]:
 
 
 def _check_row_targets(model: ReducedModel, selection: StateSelection, mode: str):
-    states = set(selection.states.tolist())
-    listed = ", ".join(repr(model.names[q]) for q in selection.states[:12])
+    states = set(selection.states.tolist()) if model.flat.rows else set()
     for row in model.flat.rows:
         if mode != "dummy_derivatives":
             raise ModelError(
@@ -112,6 +111,7 @@ def _check_row_targets(model: ReducedModel, selection: StateSelection, mode: str
         for v in row.targets:
             if model.variables[v][0] not in states:
                 name = model.flat.variables.names[v]
+                listed = ", ".join(repr(model.names[q]) for q in selection.states[:12])
                 raise ModelError(
                     f"neural block '{row.opaque.name}': its target '{name}' is not a state, so it has no row to "
                     f"add to. The states are {listed}. To make it one, compile with prefer_states=['{name}']; or "

@@ -84,17 +84,18 @@ def _known(entries: Entries, n_variables: int) -> tuple[np.ndarray, list[int]]:
     queue = collections.deque(np.flatnonzero(count == 1).tolist())
     if not queue:
         return determined_by, twice
-    by_variable = np.argsort(entries.variable, kind="stable")
-    start = np.searchsorted(entries.variable[by_variable], np.arange(n_variables + 1))
+    by_variable = np.argsort(entries.variable, kind="stable").tolist()
+    start = np.append(0, np.cumsum(np.bincount(entries.variable, minlength=n_variables))).tolist()
+    row_of, variable_of, order_of = entries.row.tolist(), entries.variable.tolist(), entries.order.tolist()
     left, last = count.tolist(), np.rint(total).astype(np.int64).tolist()  # the sum of the numbers of unknown entries
     while queue:
         row = queue.popleft()
-        if left[row] != 1 or entries.order[last[row]] != 0:
+        if left[row] != 1 or order_of[last[row]] != 0:
             continue
-        variable = int(entries.variable[last[row]])
+        variable = variable_of[last[row]]
         determined_by[variable] = row
-        for k in by_variable[start[variable] : start[variable + 1]].tolist():
-            other = int(entries.row[k])
+        for k in by_variable[start[variable] : start[variable + 1]]:
+            other = row_of[k]
             left[other] -= 1
             last[other] -= k
             if other != row and left[other] == 1:
@@ -215,10 +216,9 @@ def _floating(flat: FlatModel, groups, alias: AliasTable) -> tuple[list[str], se
     """Networks whose across variables have no level: sentences, and the components concerned."""
     variables, ports = flat.variables, flat.ports
     across = np.flatnonzero(variables.is_across)
-    local = [variables.names[v].rsplit(".", 1)[1] for v in across.tolist()]
     kinds: dict[tuple[str, str], list[int]] = {}
-    for v, name in zip(across.tolist(), local, strict=True):
-        kinds.setdefault((ports.domains[variables.port[v]], name), []).append(v)
+    for v, port in zip(across.tolist(), variables.port[across].tolist(), strict=True):
+        kinds.setdefault((ports.domains[port], variables.names[v].rsplit(".", 1)[1]), []).append(v)
     texts, components = [], set()
     for (domain, name), members in kinds.items():
         for island in _islands(flat, groups, alias, np.array(members)):

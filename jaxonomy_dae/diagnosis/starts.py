@@ -14,6 +14,7 @@ from ..model.quantities import ReducedModel
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence, compress
+from ..structure.integers import equal_rows
 from ..structure.matching import maximum_matching
 from ..tolerances import MEANT_EQUAL
 from .wording import counted, listed
@@ -30,12 +31,15 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
         gives.
     """
     table = flat.variables
-    fixed = np.flatnonzero(table.fixed).tolist()
+    fixed = np.flatnonzero(table.fixed)
     values = table.start.values(flat.declares.values)
+    quantity = alias.root[fixed] * (1 + alias.order.max(initial=0)) + alias.order[fixed]
+    _, which, count = np.unique(quantity, return_inverse=True, return_counts=True)
+    special = (count[which] > 1) | (alias.root[fixed] == ZERO) | table.is_input[alias.root[fixed]]
     notes: list[str] = []
     first: dict[tuple[int, int], int] = {}
     numbers: dict[tuple[int, int], tuple[int, float]] = {}
-    for v in fixed:
+    for v in fixed[special].tolist():
         name, start = table.names[v], table.start[v]
         assert start is not None
         number = None if start.parameters else float(values[v])
@@ -74,7 +78,9 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
                 + ("they agree, so one of them is enough" if settled else "they must agree; one of them is enough")
             )
         first.setdefault(key, v)
-    _check_linear(flat, groups, numbers)
+    alone = fixed[~special & table.start.is_number[fixed]]
+    started = np.concatenate([alone, np.array([v for v, _ in numbers.values()], np.int64)])
+    _check_linear(flat, groups, alias, started, values[started] / alias.factor[started])
     return tuple(notes)
 
 
@@ -82,14 +88,15 @@ def _equal(a: float, b: float) -> bool:
     return abs(a - b) <= MEANT_EQUAL * max(abs(a), abs(b))
 
 
-def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[int, float]]):
-    """Equations with numeric coefficients, all of whose quantities start at fixed numbers."""
-    if len(numbers) < 2:
+def _check_linear(flat: FlatModel, groups, alias: AliasTable, started: np.ndarray, numbers: np.ndarray):
+    """Equations with numeric coefficients, all of whose quantities start at fixed numbers: of the variables `started`,
+    one for each quantity."""
+    if len(started) < 2:
         return
-    highest = 1 + max(order for _, order in numbers)
-    value = np.full((len(flat.variables), highest), np.nan)
-    for (root, order), (_, number) in numbers.items():
-        value[root, order] = number
+    highest = 1 + alias.order[started].max()
+    value, variable = np.full((len(flat.variables), highest), np.nan), np.zeros((len(flat.variables), highest), int)
+    place = alias.root[started], alias.order[started]
+    value[place], variable[place] = numbers, started
     for group in groups:
         if not isinstance(group.template, LinearTemplate) or not group.variable.shape[1]:
             continue
@@ -99,8 +106,7 @@ def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[
         wrong = np.abs(terms.sum(axis=1)) > MEANT_EQUAL * np.abs(terms).max(axis=1)  # False for NaN
         if wrong.any():
             k = int(np.argmax(wrong))
-            pairs = zip(group.variable[k].tolist(), group.order[k].tolist(), strict=True)
-            names = [flat.variables.names[numbers[q][0]] for q in pairs]
+            names = [flat.variables.names[v] for v in variable[group.variable[k], group.order[k]].tolist()]
             raise StructuralError(
                 f"the fixed starts of {listed(names)} contradict the equation {group.provenance[k].located}. Free one "
                 "of them (fixed=False), or give values that agree."
@@ -113,13 +119,12 @@ def note_several_guesses(model: ReducedModel) -> tuple[str, ...]:
     v = np.flatnonzero(table.start.is_given & (variables.quantity >= 0))
     parameters = model.flat.declares.values
     value = table.start.values(parameters)[v] / variables.factor[v]
-    of: dict[int, list[int]] = {}
-    for k, q in enumerate(variables.quantity[v].tolist()):
-        of.setdefault(q, []).append(k)
+    repeated = np.flatnonzero(np.bincount(variables.quantity[v])[variables.quantity[v]] > 1)
+    several = [repeated[members].tolist() for members in equal_rows([variables.quantity[v[repeated]]])]
     leading = set(leading_starts(model, parameters).tolist())
     notes = []
-    for places in of.values():
-        if len(places) < 2 or table.fixed[v[places]].any():
+    for places in several:
+        if table.fixed[v[places]].any():
             continue
         first = next(k for k in places if int(v[k]) in leading)
         others = [k for k in places if not _equal(float(value[k]), float(value[first]))]

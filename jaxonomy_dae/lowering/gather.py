@@ -13,6 +13,7 @@ import numpy as np
 
 from ..aliases import Numeric
 from ..linear.once import joined
+from ..structure.integers import distinct
 
 Chunk = Any  # an array of shape (n,), a scalar, or a tuple of scalars
 
@@ -85,7 +86,7 @@ class Gather:
 
     def _from_several(self, chunks: list[Chunk], dtype) -> Numeric:
         breaks = np.flatnonzero((np.diff(self.chunk) != 0) | (np.diff(self.offset) != 1)) + 1
-        used = np.unique(self.chunk)
+        used = distinct(self.chunk)
         if len(breaks) < len(used) + GATHER:
             runs = np.split(np.arange(len(self.chunk)), breaks)
             return joined([self._run(chunks, run, dtype) for run in runs])

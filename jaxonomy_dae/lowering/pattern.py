@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..linear.sparse import SparsePattern
+from ..structure.integers import distinct
 from .schedule import AnyStep, SparseStep
 
 LIMIT = 30_000_000  # entries of rows, above which the pattern counts as dense
@@ -92,7 +93,7 @@ class Dependencies:
             owners.append(np.arange(n))
         if not columns:
             return ColumnSets(np.zeros(n + 1, np.int64), np.zeros(0, np.int32))
-        key = np.unique(np.concatenate(owners) * np.int64(self.width) + np.concatenate(columns))
+        key = distinct(np.concatenate(owners) * np.int64(self.width) + np.concatenate(columns))
         counts = np.bincount(key // self.width, minlength=n)
         return ColumnSets(np.concatenate([[0], np.cumsum(counts)]), (key % self.width).astype(np.int32))
 
@@ -154,7 +155,7 @@ def entries(rows: Sequence[ColumnSets]) -> tuple[np.ndarray, np.ndarray]:
 
 def unique_entries(rows: np.ndarray, columns: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     """The places, each once, by row."""
-    key = np.unique(rows.astype(np.int64) * width + columns)
+    key = distinct(rows.astype(np.int64) * width + columns)
     return key // max(1, width), key % max(1, width)
 
 
@@ -191,7 +192,7 @@ def field_rows(dependencies: Dependencies, plan: Scheduled) -> ColumnSets:
         return rows
     places, columns = entries([rows])
     for corrected, quantities in plan.corrected:
-        read = np.unique(dependencies.of(quantities).columns)
+        read = distinct(dependencies.of(quantities).columns)
         places = np.concatenate([places, np.repeat(np.array(corrected, np.int64), len(read))])
         columns = np.concatenate([columns, np.tile(read, len(corrected))])
     places, columns = unique_entries(places, columns, dependencies.width)

@@ -19,6 +19,7 @@ from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
 from ..model.quantities import QuantityMap, ReducedModel
 from ..model.tables import ZERO, FlatModel, provenance_of
+from ..structure.integers import distinct
 from . import pattern
 from .gather import Gather
 from .plan_events import EventPlan, HeldPlan
@@ -215,7 +216,7 @@ class SystemPlan:
 
     def reading(self, quantities: np.ndarray) -> Program:
         """The program that computes these quantities and nothing else."""
-        wanted = np.unique(quantities)
+        wanted = distinct(quantities)
         key = wanted.tobytes()
         if key not in self._programs:
             n, n_unknown = self.extended.quantities.n, self.extended.quantities.n_unknown

@@ -17,6 +17,7 @@ from ..compiler.order_blocks import Blocks
 from ..model.extended import Extended, ExtendedGroup
 from ..model.group import Group
 from ..model.tables import ZERO
+from ..structure.integers import distinct, equal_rows
 from ..structure.tearing import BlockSizes, Tearing, tear
 from .entry_sizes import EntrySizes
 
@@ -145,7 +146,7 @@ class Step(AbstractStep):
         return tuple(self.equations[e] for e in self.tearing.residuals)
 
     def needs(self) -> np.ndarray:
-        return np.unique(np.concatenate([e.outside.ravel() for e in self.equations]))
+        return distinct(np.concatenate([e.outside.ravel() for e in self.equations]))
 
     def behind(self, wanted: np.ndarray) -> list[tuple[StepEquation, np.ndarray]]:
         rows = np.flatnonzero(np.any([wanted[unknown] for unknown in self.unknown], axis=0))
@@ -221,8 +222,8 @@ class SparseStep(AbstractStep):
             yield 1, self.unknown[0][self.block == block], np.zeros(0, np.int64)
 
     def needs(self) -> np.ndarray:
-        read = np.unique(np.concatenate([e.quantity.ravel() for e in self.equations]))
-        return np.setdiff1d(read, self.unknown[0], assume_unique=True)
+        read = distinct(np.concatenate([e.quantity.ravel() for e in self.equations]))
+        return read[~np.isin(read, self.unknown[0])]
 
 
 AnyStep = Step | SparseStep
@@ -283,11 +284,8 @@ def _single_steps(group: ExtendedGroup, g: int, row_of, blocks: Blocks, places, 
     unknown = blocks.unknowns[places]
     level = blocks.level[block_of_place[places]]
     hit = group.quantity[rows] == unknown[:, None]
-    shapes: dict[tuple, list[int]] = {}
-    for k, (lv, pattern) in enumerate(zip(level.tolist(), map(bytes, hit), strict=True)):
-        shapes.setdefault((lv, pattern), []).append(k)
-    for (lv, _), members in shapes.items():
-        r = rows[members]
+    for members in equal_rows([level, *np.packbits(hit, axis=1).T]):
+        r, lv = rows[members], int(level[members[0]])
         positions = np.flatnonzero(hit[members[0]])
         equation = equation_of(group, r, {int(p): 0 for p in positions})
         template = group.template

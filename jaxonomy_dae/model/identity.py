@@ -11,7 +11,7 @@ import enum
 import functools
 import hashlib
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -106,8 +106,10 @@ class _Walk:
             return _digest("function", self._number(part), getattr(part, "__qualname__", name).encode())
         raise TypeError(f"it is not known what makes two objects of type {type(part)} equal")
 
-    def _all(self, name: str, parts: Iterable[object]) -> bytes:
-        return _digest(name, *map(self.digest, parts))
+    def _all(self, name: str, parts: Sequence[object]) -> bytes:
+        each = {id(part): part for part in parts}  # a few objects may stand at millions of places
+        digests = {key: self.digest(part) for key, part in each.items()}
+        return _digest(name, b"".join([digests[id(part)] for part in parts]))
 
     def _number(self, function: Callable) -> bytes:
         """The place of a function among those met so far."""

@@ -43,7 +43,9 @@ def name_quantities(flat: FlatModel, variables: QuantityMap, quantities: Quantit
     names: list[str] = [""] * quantities.n
     for k, best in zip(named.tolist(), v[sorting[first]].tolist(), strict=True):
         names[k] = table.names[best]
-    for k in np.setdiff1d(np.arange(quantities.n), named).tolist():
+    unnamed = np.ones(quantities.n, bool)
+    unnamed[named] = False
+    for k in np.flatnonzero(unnamed).tolist():
         names[k] = f"der({names[k - 1]})"
     return names
 

@@ -5,6 +5,7 @@ import weakref
 import numpy as np
 from jaxtyping import Float
 
+from ..structure.integers import distinct
 from ..tolerances import KNOWN
 from .declared import declared_scale
 from .extended import Extended
@@ -57,7 +58,7 @@ class _Balance:
     def __init__(self, extended: Extended):
         self.factors = Factors()
         read = [group.parameter.ravel() for group in extended.groups]
-        self.read = np.unique(np.concatenate([np.zeros(0, np.int64), *read]))
+        self.read = distinct(np.concatenate([np.zeros(0, np.int64), *read]))
         q = extended.quantities
         lower = np.flatnonzero((q.owner[:-1] == q.owner[1:]) & (q.order[1:] == q.order[:-1] + 1))
         self.rates = (lower, lower + 1) if len(lower) else None

@@ -1,6 +1,7 @@
 """Arrays of components: one component object stands for all instances, and what differs between them is data."""
 
 import inspect
+import itertools
 import math
 import operator
 from collections.abc import Iterator
@@ -94,6 +95,10 @@ class ComponentArray:
     def label(self, number: int) -> str:
         """The index of an instance as names have it: `[17]`, `[2,3]`."""
         return "[" + ",".join(map(str, np.unravel_index(number, self.shape))) + "]"
+
+    def labels(self) -> list[str]:
+        """The indices of all instances."""
+        return [f"[{','.join(index)}]" for index in itertools.product(*(map(str, range(n)) for n in self.shape))]
 
     def instance(self, number: int) -> str:
         """The path of what was chosen of an instance, as the component now being written sees it, with a final dot."""
