@@ -29,5 +29,7 @@ def test_identity_does_not_ask_whether_equal_parts_are_one_object():
     """Parts that stand at many places are digested once, and the digest still follows their values and order."""
     one, same, other = np.arange(3), np.arange(3), np.arange(4)
     assert Identity.of([one, one, other]).digest == Identity.of([one, same, other]).digest
-    digests = {Identity.of(parts).digest for parts in ([one, one, other], [one, other, one], [one, other], [other, one])}
+    digests = {
+        Identity.of(parts).digest for parts in ([one, one, other], [one, other, one], [one, other], [other, one])
+    }
     assert len(digests) == 4
