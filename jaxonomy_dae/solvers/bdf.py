@@ -18,7 +18,7 @@ from .bdf_coefficients import Coefficients, coefficients, interpolate
 from .choice_guard import ChoiceGuard
 from .dae_term import FlatProblem
 from .index_one import consistent_point, consistent_slope
-from .newton import Tolerances, implicit_step
+from .newton import Equation, Known, Tolerances, implicit_step
 from .projected import Projection
 from .step_control import encoded
 
@@ -216,11 +216,9 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         predicted = jnp.tensordot(c.upto.astype(y.dtype), phi, axes=1)
         slope = jnp.tensordot(c.gamma.astype(y.dtype), phi, axes=1)
         cj = c.leading
-        solved = implicit_step(
-            problem, linear, t1, predicted, slope, cj,
-            weight=weight, norm=norm, max_iterations=self.root_find_max_steps,
-            factor=state.factor, factor_cj=state.factor_cj, last_cj=state.last_cj, contraction=state.contraction,
-        )  # fmt: skip
+        equation = Equation(t1, predicted, slope, cj)
+        known = Known(state.factor, state.factor_cj, state.last_cj, state.contraction, weight)
+        solved = implicit_step(problem, linear, equation, known, norm, self.root_find_max_steps)
         y1 = solved.y
         if self.projection is not None:
             moved = ravel_like(self.projection(t1, problem.unravel(y1), args))

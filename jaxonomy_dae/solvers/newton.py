@@ -12,11 +12,12 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from ..aliases import PyTree, Tolerance
 from ..errors import ModelError
 from ..linear.choice import LinearAlgebra
+from ..linear.mass import Mass
 from ..private_names import FROM_CONTROLLER
 from .dae_term import FlatProblem
 
 CONVERGED = 0.1  # of the local error's tolerance (Brenan, Campbell & Petzold 1996, section 5.2.2)
-# The following, and the numbers in `attempt`, are those of IDA (Hindmarsh et al. 2005, ACM TOMS 31:363).
+# The following, and the numbers in `_found`, are those of IDA (Hindmarsh et al. 2005, ACM TOMS 31:363).
 DIVERGED = 0.9  # contraction rate above which an iteration is given up
 STALE = 0.25  # relative change of the leading coefficient that a factorisation survives
 
@@ -39,12 +40,36 @@ class Tolerances(eqx.Module):
         return jnp.asarray(self.rtol, dtype), atol[0] if atol.shape[0] == 1 else atol, self.norm
 
 
+class Equation(NamedTuple):
+    """M (slope + c_j (y − predicted)) = F(t, y), the equation of a step for y."""
+
+    t: Float[ArrayLike, ""]
+    predicted: Float[Array, " n"]
+    slope: Float[Array, " n"]
+    cj: Float[Array, ""]
+
+    def residual(self, mass: Mass, right: Callable[..., Array], y: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The left side minus the right one."""
+        return mass.times(self.slope + self.cj.astype(y.dtype) * (y - self.predicted)) - right(self.t, y)
+
+
+class Known(NamedTuple):
+    """What earlier steps have left: a factorisation and its c_j, the c_j and ρ/(1 − ρ) of the last iteration; and the
+    weight of each unknown in norms."""
+
+    factor: PyTree  # as the linear algebra keeps it
+    factor_cj: Float[Array, ""]
+    last_cj: Float[Array, ""]
+    contraction: Float[Array, ""]
+    weight: Float[Array, " n"]
+
+
 class Solved(NamedTuple):
     """The outcome of `implicit_step`."""
 
     y: Float[Array, " n"]
     converged: Bool[Array, ""]
-    factor: PyTree  # as the linear algebra keeps it
+    factor: PyTree
     factor_cj: Float[Array, ""]
     contraction: Float[Array, ""]
     factorisations: Int[Array, ""]
@@ -54,100 +79,94 @@ class Solved(NamedTuple):
 def implicit_step(
     problem: FlatProblem,
     linear: LinearAlgebra,
-    t: Float[ArrayLike, ""],
-    predicted: Float[Array, " n"],
-    slope: Float[Array, " n"],
-    cj: Float[Array, ""],
-    *,
-    weight: Float[Array, " n"],
-    norm: Callable[[PyTree], PyTree],
+    equation: Equation,
+    known: Known,
+    norm: Callable[[PyTree], Array],
     max_iterations: int,
-    factor: PyTree,
-    factor_cj: Float[Array, ""],
-    last_cj: Float[Array, ""],
-    contraction: Float[Array, ""],
 ) -> Solved:
-    """Solves M (slope + c_j (y − predicted)) = F(t, y).
+    """Solves the equation of a step.
 
     The factorisation at hand serves if its leading coefficient is near; where the iteration then fails, it is made anew
     at the prediction and tried once more. The derivative of y is that of the equation, whatever factorisation was used.
     """
-    right = eqx.filter_closure_convert(problem.right, t, predicted)
-    dtype = predicted.dtype
+    right = eqx.filter_closure_convert(problem.right, equation.t, equation.predicted)
+    mass = problem.mass
 
     @eqx.filter_custom_jvp
-    def root(right, t, predicted, slope, cj, history):
-        factor, factor_cj, last_cj, contraction, weight = history
-        mass, y_cj = problem.mass, cj.astype(dtype)
-
-        def residual(y):
-            return mass.times(slope + y_cj * (y - predicted)) - right(t, y)
-
-        def fresh():
-            _, jacobian = linear.jacobian(lambda y: right(t, y), predicted)
-            return linear.factor(linear.combine(mass, y_cj, jacobian)), cj
-
-        ratio = cj / jnp.where(factor_cj == 0, 1, factor_cj)
-        near = (1 - STALE) / (1 + STALE)
-        stale = (factor_cj == 0) | (ratio < near) | (ratio > 1 / near)
-
-        def attempt(carry):
-            renew, _, factor, factor_cj, contraction, made, iterations = carry
-            factor, factor_cj = jax.lax.cond(renew, fresh, lambda: (factor, factor_cj))
-            changed = renew | (cj != last_cj)
-            # ρ/(1−ρ) is not known before the second iteration. A pessimistic guess makes sure of two iterations, unless
-            # the first change is far below the tolerance: 20 for a new factorisation, 100 for one of another c_j.
-            contraction = jnp.where(renew, 20.0, jnp.where(changed, 100.0, contraction))
-            # An old factorisation belongs to another c_j, which this factor makes up for (section 5.2.2).
-            scale = (2 / (1 + cj / factor_cj)).astype(dtype)
-
-            def change(y):
-                return -scale * linear.apply(factor, None, residual(y))
-
-            y, m, contraction, done = _iterated(
-                change, predicted, contraction.astype(dtype), lambda v: norm(v * weight), max_iterations
-            )
-            contraction = contraction.astype(cj.dtype)
-            out = y, factor, factor_cj, contraction, made + renew.astype(jnp.int32), iterations + m
-            return done, out
-
-        def body(carry):
-            renew, _, (_, factor, factor_cj, contraction, made, iterations), _ = carry
-            done, out = attempt((renew, None, factor, factor_cj, contraction, made, iterations))
-            return jnp.array(True), done, out, renew
-
-        # Twice at most: with the factorisation at hand, and if that fails, with one made at the prediction. A second
-        # failure there is one of the step size, which the error test shortens.
-        def unfinished(carry):
-            _, done, _, was_fresh = carry
-            return ~done & ~was_fresh
-
-        zero = jnp.array(0, jnp.int32)
-        start = (stale, jnp.array(False), (predicted, factor, factor_cj, contraction, zero, zero), jnp.array(False))
-        _, done, (y, *rest), _ = jax.lax.while_loop(unfinished, body, start)
-        y = jnp.where(done & jnp.isfinite(y).all(), y, predicted)
-        return y, (done, *rest)
+    def root(right, equation, known):
+        found = _found(linear, mass, right, equation, known, norm, max_iterations)
+        return found.y, found[1:]
 
     @root.def_jvp
     def _(primals, tangents):
-        right, t, predicted, slope, cj, history = primals
-        y, rest = root(right, t, predicted, slope, cj, history)
+        right, equation, known = primals
+        y, rest = root(right, equation, known)
 
-        def at(right, t, predicted, slope, cj):
-            return problem.mass.times(slope + cj.astype(dtype) * (y - predicted)) - right(t, y)
+        def at(right, equation):
+            return equation.residual(mass, right, y)
 
-        moved = (*tangents[:5],)
-        _, change = eqx.filter_jvp(at, (right, t, predicted, slope, cj), moved)
-        _, jacobian = linear.jacobian(lambda v: right(t, v), y)
-        matrix = linear.combine(problem.mass, cj.astype(dtype), jacobian)
+        _, change = eqx.filter_jvp(at, (right, equation), tuple(tangents[:2]))
+        _, jacobian = linear.jacobian(lambda v: right(equation.t, v), y)
+        matrix = linear.combine(mass, equation.cj.astype(y.dtype), jacobian)
         tangent = linear.solve(linear.factor(matrix), matrix, -change)
-        still = jax.tree.map(lambda v: None, rest)
-        return (y, rest), (tangent, still)
+        return (y, rest), (tangent, jax.tree.map(lambda v: None, rest))
 
-    still = jax.lax.stop_gradient
-    y, rest = root(right, t, predicted, slope, cj, still((factor, factor_cj, last_cj, contraction, weight)))
-    done, factor, factor_cj, contraction, made, iterations = still(rest)
-    return Solved(y, done, factor, factor_cj, contraction, made.astype(jnp.int32), iterations.astype(jnp.int32))
+    y, rest = root(right, equation, jax.lax.stop_gradient(known))
+    return Solved(y, *jax.lax.stop_gradient(rest))
+
+
+def _found(
+    linear: LinearAlgebra,
+    mass: Mass,
+    right: Callable[..., Array],
+    equation: Equation,
+    known: Known,
+    norm: Callable[[PyTree], Array],
+    max_iterations: int,
+) -> Solved:
+    """The solution, found with the factorisation at hand, or with one made at the prediction. A second failure there is
+    one of the step size, which the error test shortens."""
+    t, predicted, cj, dtype = equation.t, equation.predicted, equation.cj, equation.predicted.dtype
+
+    def fresh():
+        _, jacobian = linear.jacobian(lambda y: right(t, y), predicted)
+        return linear.factor(linear.combine(mass, cj.astype(dtype), jacobian)), cj
+
+    def attempt(carry):
+        renew, solved, _ = carry
+        factor, factor_cj = jax.lax.cond(renew, fresh, lambda: (solved.factor, solved.factor_cj))
+        changed = renew | (cj != known.last_cj)
+        # ρ/(1−ρ) is not known before the second iteration. A pessimistic guess makes sure of two iterations, unless
+        # the first change is far below the tolerance: 20 for a new factorisation, 100 for one of another c_j.
+        contraction = jnp.where(renew, 20.0, jnp.where(changed, 100.0, solved.contraction))
+        # An old factorisation belongs to another c_j, which this factor makes up for (section 5.2.2).
+        scale = (2 / (1 + cj / factor_cj)).astype(dtype)
+
+        def change(y):
+            return -scale * linear.apply(factor, None, equation.residual(mass, right, y))
+
+        y, m, contraction, done = _iterated(
+            change, predicted, contraction.astype(dtype), lambda v: norm(v * known.weight), max_iterations
+        )
+        made, iterations = solved.factorisations + renew.astype(jnp.int32), solved.iterations + m
+        return (
+            jnp.array(True),
+            Solved(y, done, factor, factor_cj, contraction.astype(cj.dtype), made, iterations),
+            renew,
+        )
+
+    def unfinished(carry):
+        _, solved, was_fresh = carry
+        return ~solved.converged & ~was_fresh
+
+    ratio = cj / jnp.where(known.factor_cj == 0, 1, known.factor_cj)
+    near = (1 - STALE) / (1 + STALE)
+    stale = (known.factor_cj == 0) | (ratio < near) | (ratio > 1 / near)
+    zero, no = jnp.array(0, jnp.int32), jnp.array(False)
+    begin = Solved(predicted, no, known.factor, known.factor_cj, known.contraction, zero, zero)
+    _, solved, _ = jax.lax.while_loop(unfinished, attempt, (stale, begin, no))
+    y = jnp.where(solved.converged & jnp.isfinite(solved.y).all(), solved.y, predicted)
+    return solved._replace(y=y)
 
 
 def _iterated(
