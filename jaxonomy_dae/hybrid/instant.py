@@ -72,18 +72,21 @@ class Arrival(NamedTuple):
 class Happening(NamedTuple):
     """What happens now, as one: an event, or several that strike together.
 
-    - `event`: the number of the first of them; `these`: all of them, shape (clocks + guards,).
+    - `event`: the number of the first of them; `is_clock`: whether that is one of a clock.
+    - `these`: all of them, shape (clocks + guards,).
     - `delay`: δ of the first (second).
     - `moved`: whether they wrote states.
-    - `approach`: how fast guards changed before, shape (guards,); zero where that is not known.
+    - `rates`: how fast guards changed before, shape (guards,); `approach`: the same, zero where that is not known.
     - `rose`, `onto`: the guards that had just risen to zero, and those that had jumped onto it, shape (guards,).
     - `waits`: the guards that begin to fall from zero after this instant, shape (guards,).
     """
 
     event: Array
+    is_clock: Array
     these: Array
     delay: Time
-    moved: Array
+    rates: Array
+    moved: Array | np.bool_
     approach: Array
     rose: Array
     onto: Array
