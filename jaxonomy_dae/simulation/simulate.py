@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..adjoint.stored_adjoint import default_adjoint
-from ..aliases import Args, Solver, Time, Times, Tolerance
+from ..aliases import Args, Controller, Solver, Time, Times, Tolerance
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..initialization.check import check
-from ..initialization.initialize import known_start, search_outside
+from ..initialization.initialize import InitialPoint, known_start, search_outside
+from ..initialization.ladder import Found
 from ..programs.cache import PROGRAMS
 from ..programs.members import batch_size, is_batched
 from ..programs.rows import filled_up
@@ -27,7 +28,7 @@ from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
 from ..solvers.switching import BOUNDARY, MANY, SHARE, Watch
 from ..system.input_values import check_given
-from ..system.inputs import check_range, read_inputs, step_ends
+from ..system.inputs import StepEnds, check_range, read_inputs, step_ends
 from ..system.solver_choice import Choice, Stiffness, implicit_choice, solver_choice
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
@@ -36,7 +37,7 @@ from .failures import OKAY, explain, failed_in_batch, is_code, mode_at_start, ra
 from .from_state import check_state
 from .integration import Given, Options, Outcome, run, run_compiled
 from .preparation import term_of
-from .saved_state import SavedState, initial_time
+from .saved_state import Memory, SavedState, initial_time
 from .solution import Asked, Solution
 from .step_sizes import clipped, controller_for, scaled_atol
 
@@ -161,166 +162,262 @@ def simulate(
     ts = ts if ts is None or hasattr(ts, "ndim") else as_array(ts)
     if isinstance(control, str):
         raise ModelError(f"control is a list of variables' names; write control=[{control!r}]")
-    control = tuple(control)
     check_switches(max_events, save_events=save_events, progress=progress, throw=throw)
     check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
     t0 = initial_time(t0, initial)
     dtype = system.parameters.values.dtype
-    as_given = t0, inputs, initial  # inside jit, arrays made of these have no values
-    inputs = read_inputs(system.plan, dtype, inputs)
-    check_given(system.plan, inputs)
-    check_range(inputs, t0, t1)
-    ends = step_ends(system.plan, inputs)
+    read = read_inputs(system.plan, dtype, inputs)
+    check_given(system.plan, read)
+    check_range(read, t0, t1)
     rtol, atol = default_tolerances(rtol, atol, dtype)
-    if stepsize_controller is None:
+    prescribed = stepsize_controller is not None
+    if not prescribed:
         check_tolerances(rtol, atol, dtype)
+    elif control:
+        raise ModelError("control= and stepsize_controller= both say what errors count: leave one of them out")
     rtol, atol = on_device(rtol, dtype), on_device(atol, dtype)
     dtmax = None if dtmax is None else on_device(dtmax, dtype)
     jump_ts = jump_times(jump_ts, dtype)
-    # Numbers become arrays, so that another value is not another program.
+    given = _given(system, t0, t1, ts, read, initial)
+    begun = None
+    if isinstance(given.initial, Mapping):  # one search for all runs of this call, whichever solvers they take
+        # Inside jit, arrays made of these have no values.
+        begun = (
+            known_start(system, t0, inputs, initial)
+            if is_staged(given)
+            else search_outside(system, given.t0, given.inputs, given.initial)
+        )
+    tolerances = None if prescribed else (rtol, scaled_atol(system, atol))
+    call = _Call(
+        system=system,
+        given=given,
+        begun=begun,
+        choice=solver_choice(system.plan) if solver is None else Choice(type(solver).__name__, "as asked for", True),
+        solver=solver,
+        rtol=rtol,
+        atol=atol,
+        dtmax=dtmax,
+        jump_ts=jump_ts,
+        control=tuple(control),
+        ends=step_ends(system.plan, read),
+        adjoint=adjoint,
+        controller=stepsize_controller,
+        max_steps=max_steps,
+        max_events=max_events,
+        save_events=save_events,
+        progress=progress,
+        throw=throw,
+        known=not is_traced((given, adjoint, stepsize_controller)),
+        duration=None if is_traced((t0, t1)) else float(t1) - float(t0),
+        asked=Asked.of(
+            jump_ts, dtmax, max_steps, None if prescribed else solver, tuple(control), tolerances, throw is not False
+        ),
+    )
+    return call.traced() if is_traced((given, call.options())) else call.outside()
+
+
+def _given(system: AcausalSystem, t0: Time, t1: Time, ts: Times, inputs: Args, initial: Any) -> Given:
+    """What is integrated. Numbers become arrays, so that another value is not another program."""
+    dtype = system.parameters.values.dtype
     if initial is None or isinstance(initial, Mapping):
         initial = {name: on_device(v, dtype) for name, v in sorted((initial or {}).items())}
     else:
         initial = jax.tree.map(lambda part: on_device(part, dtype), initial)
-    duration = None if is_traced((t0, t1)) else float(t1) - float(t0)
     t0, t1 = on_device(t0, dtype), on_device(t1, dtype)
     if ts is not None:
         ts = on_device(ts, dtype)
         if not is_traced((t0, t1, ts)):
             # `check_arguments` lets rounding pass, Diffrax does not.
             ts = on_device(np.clip(np.asarray(ts), t0, t1), dtype)
-    # The solver is chosen here, so that the programs of models that differ in how stiff they are are the same.
-    given = Given(dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
-    staged = is_staged(given)
-    begun = None
-    if isinstance(initial, Mapping):  # one search for all runs of this call, whichever solvers they take
-        begun = known_start(system, *as_given) if staged else search_outside(system, t0, inputs, initial)
-    most_events = MOST_EVENTS if max_events is None else max_events
-    known = not is_traced((given, adjoint, stepsize_controller))
+    # The solver is chosen by `simulate`, so that the programs of models that differ in how stiff they are are the same.
+    return Given(dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
 
-    def options(solver: Solver, room: int = ROOM) -> Options:
-        events = system.plan.events
-        listed = room if max_events is None else max_events
+
+@dataclasses.dataclass(frozen=True)
+class _Call:
+    """A call of `simulate`: what is integrated, the solver chosen, and the options as they were checked.
+
+    - `begun`: what is known of the start; `known`: whether nothing is traced; `duration`: of the run, None if traced.
+    """
+
+    system: AcausalSystem
+    given: Given
+    begun: Found | InitialPoint | None
+    choice: Choice
+    solver: Solver  # None: that of the choice
+    rtol: Tolerance
+    atol: Tolerance
+    dtmax: Time
+    jump_ts: Times
+    control: tuple[str, ...]
+    ends: StepEnds
+    adjoint: diffrax.AbstractAdjoint | None
+    controller: Controller
+    max_steps: int
+    max_events: int | None
+    save_events: bool | None
+    progress: bool
+    throw: bool | None
+    known: bool
+    duration: float | None
+    asked: Asked
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """The largest numbers of steps and of events."""
+        return self.max_steps, MOST_EVENTS if self.max_events is None else self.max_events
+
+    @property
+    def run_by(self) -> Solver:
+        """The solver of a run."""
+        return SOLVERS[self.choice.solver]() if self.solver is None else self.solver
+
+    @property
+    def switches(self) -> bool:
+        """True if another solver may take the place of the one chosen."""
+        return not self.choice.final and self.controller is None
+
+    def implicit(self, why: str) -> "_Call":
+        """The same with an implicit solver."""
+        return dataclasses.replace(self, choice=implicit_choice(self.system.plan, why))
+
+    def options(self, room: int = ROOM) -> Options:
+        """The options of a run whose log has room for so many events."""
+        system, solver, events = self.system, self.run_by, self.system.plan.events
+        listed = room if self.max_events is None else self.max_events
         room = listed if events is not None and events.are_listed else 0
         few = room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS
-        sides = few and known if save_events is None else save_events
-        steps = stepsize_controller
+        steps, adjoint = self.controller, self.adjoint
         if steps is None:
-            steps = controller_for(system, solver, rtol, atol, dtmax, control)
-        chosen = adjoint
-        if chosen is None:
-            chosen = default_adjoint(is_forwards(given), batch_size(given), known)
+            steps = controller_for(system, solver, self.rtol, self.atol, self.dtmax, self.control)
+        if adjoint is None:
+            adjoint = default_adjoint(is_forwards(self.given), batch_size(self.given), self.known)
         return Options(
             solver=solver,
-            adjoint=chosen,
-            controller=clipped(steps, jump_ts, ends),
-            max_steps=max_steps + ends.count,
-            progress=progress,
-            max_events=most_events,
+            adjoint=adjoint,
+            controller=clipped(steps, self.jump_ts, self.ends),
+            max_steps=self.max_steps + self.ends.count,
+            progress=self.progress,
+            max_events=self.bounds[1],
             room=room,
-            save_events=sides,
+            save_events=few and self.known if self.save_events is None else self.save_events,
         )
 
-    if control and stepsize_controller is not None:
-        raise ModelError("control= and stepsize_controller= both say what errors count: leave one of them out")
-    prescribed = stepsize_controller is not None
-    tolerances = None if prescribed else (rtol, scaled_atol(system, atol))
-    asked = Asked.of(jump_ts, dtmax, max_steps, None if prescribed else solver, control, tolerances, throw is not False)
-    if solver is None:
-        choice = solver_choice(system.plan)
-        solver = SOLVERS[choice.solver]()
-    else:
-        choice = Choice(type(solver).__name__, "as asked for", final=True)
-
-    def watch(traced: bool) -> Watch | None:
-        # Where the default cannot be replaced, it would cost every program inside jit 1 to 2 % of its lines.
-        if prescribed or not isinstance(solver, diffrax.Tsit5) or (traced and not choice.final):
+    def watch(self, traced: bool) -> Watch | None:
+        """What watches whether explicit steps are the right ones. Where the default cannot be replaced, it would cost
+        every program inside jit 1 to 2 % of its lines."""
+        final = self.choice.final
+        if self.controller is not None or not isinstance(self.run_by, diffrax.Tsit5) or (traced and not final):
             return None
-        size = scaled_atol(system, atol)
-        known = not is_traced((size, rtol))
-        floor = on_device(np.divide(size, rtol) if known else jnp.divide(size, rtol), dtype)
-        return Watch(t1, floor, int(SHARE * max_steps), of_run=True) if choice.final else Watch(t1, floor)
+        size = scaled_atol(self.system, self.atol)
+        known = not is_traced((size, self.rtol))
+        floor = on_device(np.divide(size, self.rtol) if known else jnp.divide(size, self.rtol), size.dtype)
+        return (
+            Watch(self.given.t1, floor, int(SHARE * self.max_steps), of_run=True)
+            if final
+            else Watch(self.given.t1, floor)
+        )
 
-    def in_program(staged: bool) -> Solution:
-        checked = throw is True
+    def traced(self) -> Solution:
+        """The solution inside jit, grad or vmap."""
+        call, why = self, _stiff_without_a_run(self.system.stiffness, self.duration) if self.switches else ""
+        if why:
+            call = self.implicit(why)
+        return call.in_program(is_staged((self.given, call.options())))
+
+    def in_program(self, staged: bool) -> Solution:
+        """The solution where values cannot be read."""
+        checked = self.throw is True
         if staged:
             PROGRAMS.make_room()
-            outcome = run(given, options(solver), watch(True), checked, begun)
+            outcome = run(self.given, self.options(), self.watch(True), checked, self.begun)
         else:  # under `jax.grad` and `jax.vmap` outside of jit, where values are known
-            checked = throw is not False
-            outcome = run_compiled(given, options(solver), watch(True), begun=begun)
+            checked = self.throw is not False
+            outcome = run_compiled(self.given, self.options(), self.watch(True), begun=self.begun)
             if is_batched(outcome.result):
-                _say_of_members(outcome, system, (max_steps, most_events), throw)
+                _say_of_members(outcome, self.system, self.bounds, self.throw)
                 checked = False
-        return _traced(outcome, system, inputs, choice, asked, checked, (max_steps, most_events))
+        x = outcome.x
+        if checked:
+            x = raised(x, outcome.result, self.system.plan.events is not None, *self.bounds)
+        return self._solution(outcome, outcome.stats, (outcome.ts, x, outcome.discrete), outcome.memory)
 
-    traced = is_traced((given, options(solver)))
-    switches = not choice.final and stepsize_controller is None
-    if traced:
-        why = _stiff_without_a_run(system.stiffness, duration) if switches else ""
-        if why:
-            choice = implicit_choice(system.plan, why)
-            solver = SOLVERS[choice.solver]()
-        return in_program(is_staged((given, options(solver))))
-    room = _room_for(_expected_events(system, float(t1) - float(t0)))
-    room = room if room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS else ROOM
-    given_rows = given if ts is None else dataclasses.replace(given, ts=filled_up(ts))
-    outcome = run_compiled(given_rows, options(solver, room), watch(False), begun=begun)
-    if is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
-        return in_program(staged=True)
-    counts = outcome.numbers()
-    if throw is not False:
-        check_parameters(system)
-        if isinstance(initial, Mapping):
-            check(system, outcome.found, t0, inputs, initial)
-        else:
-            check_state(outcome.found)
-    if switches:
-        stiff = bool(outcome.is_stiff)
-        if is_code(outcome.result, diffrax.RESULTS.max_steps_reached):
-            there = system if outcome.held is None else system.holding(outcome.held)
-            decay = decay_at(term_of(there, implicit=False), inputs, *outcome.last)
-            stiff = is_stiff(decay, float(t1 - outcome.last[0]), max_steps)
-        if stiff:
-            found = f"stiff: stability limits explicit steps from t={float(outcome.last[0]):.3g} on"
-            choice = implicit_choice(system.plan, found)
-            solver = SOLVERS[choice.solver]()
-            before = {"num_explicit_steps": counts["num_steps"], "stiff_from": float(outcome.last[0])}
-            outcome = run_compiled(given_rows, options(solver, room), None, begun=begun)
+    def outside(self) -> Solution:
+        """The solution where values are known. Runs are repeated with an implicit solver, or with more room for events,
+        if they turn out to need it."""
+        call, given, system = self, self.given, self.system
+        room = _room_for(_expected_events(system, float(given.t1) - float(given.t0)))
+        room = room if room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS else ROOM
+        rows = given if given.ts is None else dataclasses.replace(given, ts=filled_up(given.ts))
+        outcome = run_compiled(rows, call.options(room), call.watch(False), begun=call.begun)
+        if is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
+            return call.in_program(staged=True)
+        counts = outcome.numbers()
+        if self.throw is not False:
+            check_parameters(system)
+            if isinstance(given.initial, Mapping):
+                check(system, outcome.found, given.t0, given.inputs, given.initial)
+            else:
+                check_state(outcome.found)
+        if self.switches and self._is_stiff(outcome):
+            t = float(outcome.last[0])
+            call = self.implicit(f"stiff: stability limits explicit steps from t={t:.3g} on")
+            before = {"num_explicit_steps": counts["num_steps"], "stiff_from": t}
+            outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
             counts = outcome.numbers() | before
-    if outcome.events is not None and max_events is None and float(outcome.events.count) > room:
-        room = _room_for(float(outcome.events.count))
-        outcome = run_compiled(given_rows, options(solver, room), None, begun=begun)
-    memory, n = outcome.memory, len(ts) if ts is not None else counts["num_accepted_steps"] + 1
-    saved, x, discrete = (outcome.ts, outcome.x, outcome.discrete)
-    if n < len(saved):
-        saved, x, discrete = jax.tree.map(lambda rows: picked(rows, slice(n)), (saved, x, discrete))
-        memory = memory if memory is None else memory.first(n)
-    solution = Solution(
-        ts=saved,
-        states=x,
-        system=system,
-        inputs=inputs,
-        counts=counts,
-        result=outcome.result,
-        solver=choice.solver,
-        reason=choice.reason,
-        discrete=discrete,
-        event_log=outcome.events,
-        memory=memory,
-        asked=asked,
-    )
-    if throw is not False and not is_code(outcome.result, *OKAY):
-        first = t0, outcome.found.x
-        held = system.holding(initial.discrete) if isinstance(initial, SavedState) else system
-        mode = mode_at_start(held, inputs, *first)
+        if outcome.events is not None and self.max_events is None and float(outcome.events.count) > room:
+            room = _room_for(float(outcome.events.count))
+            outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
+        memory, n = outcome.memory, len(given.ts) if given.ts is not None else counts["num_accepted_steps"] + 1
+        saved = (outcome.ts, outcome.x, outcome.discrete)
+        if n < len(outcome.ts):
+            saved = jax.tree.map(lambda rows: picked(rows, slice(n)), saved)
+            memory = memory if memory is None else memory.first(n)
+        solution = call._solution(outcome, counts, saved, memory)
+        if self.throw is not False and not is_code(outcome.result, *OKAY):
+            raise call._failure(solution, outcome)
+        return solution
+
+    def _is_stiff(self, outcome: Outcome) -> bool:
+        """True if stability limited the steps of a run, or would have, had it gone on."""
+        if not is_code(outcome.result, diffrax.RESULTS.max_steps_reached):
+            return bool(outcome.is_stiff)
+        there = self.system if outcome.held is None else self.system.holding(outcome.held)
+        decay = decay_at(term_of(there, implicit=False), self.given.inputs, *outcome.last)
+        return is_stiff(decay, float(self.given.t1 - outcome.last[0]), self.max_steps)
+
+    def _solution(
+        self, outcome: Outcome, counts: dict[str, Any], saved: tuple[Any, Any, Any], memory: Memory | None
+    ) -> Solution:
+        ts, states, discrete = saved
+        return Solution(
+            ts=ts,
+            states=states,
+            system=self.system,
+            inputs=self.given.inputs,
+            counts=counts,
+            result=outcome.result,
+            solver=self.choice.solver,
+            reason=self.choice.reason,
+            discrete=discrete,
+            event_log=outcome.events,
+            memory=memory,
+            asked=self.asked,
+        )
+
+    def _failure(self, solution: Solution, outcome: Outcome) -> Exception:
+        """The error of a run that failed."""
+        given, system = self.given, self.system
+        first = given.t0, outcome.found.x
+        held = system.holding(given.initial.discrete) if isinstance(given.initial, SavedState) else system
+        mode = mode_at_start(held, given.inputs, *first)
         if mode:
-            raise InitializationError(mode)
+            return InitializationError(mode)
         if outcome.held is not None:
             solution = eqx.tree_at(lambda s: s.system, solution, system.holding(outcome.held))
-        text = explain(solution, first, outcome.last, t1, is_implicit(solver), max_steps, most_events, rtol, atol)
-        raise SimulationError(text)
-    return solution
+        implicit, (steps, events) = is_implicit(self.run_by), self.bounds
+        text = explain(solution, first, outcome.last, given.t1, implicit, steps, events, self.rtol, self.atol)
+        return SimulationError(text)
 
 
 def _expected_events(system: AcausalSystem, duration: float) -> float:
@@ -353,33 +450,4 @@ def _say_of_members(outcome: Outcome, system: AcausalSystem, bounds: tuple[int, 
     if text and throw:
         raise SimulationError(text)
     if text:
-        warnings.warn(text, RuntimeWarning, stacklevel=5)
-
-
-def _traced(
-    outcome: Outcome,
-    system: AcausalSystem,
-    inputs: Args,
-    choice: Choice,
-    asked: Asked,
-    checked: bool,
-    bounds: tuple[int, int],
-) -> Solution:
-    """The solution where values cannot be read: inside jit, grad or vmap."""
-    x = outcome.x
-    if checked:
-        x = raised(x, outcome.result, system.plan.events is not None, *bounds)
-    return Solution(
-        ts=outcome.ts,
-        states=x,
-        system=system,
-        inputs=inputs,
-        counts=outcome.stats,
-        result=outcome.result,
-        solver=choice.solver,
-        reason=choice.reason,
-        discrete=outcome.discrete,
-        event_log=outcome.events,
-        memory=outcome.memory,
-        asked=asked,
-    )
+        warnings.warn(text, RuntimeWarning, stacklevel=6)
