@@ -44,9 +44,10 @@ demo: $(VENV)/.stamp-demo
 	$(BIN)/python examples/neural_dae_pendulum_drag.py
 
 # Most of the time goes into compiling programs that run once. XLA's older code generator takes half of it, and without
-# optimization a third less again; the programs are slower. test-floors compiles as users do.
+# optimization a third less again, and in one part a twentieth less; the programs are slower. test-floors compiles as
+# users do.
 QUICK_COMPILES := XLA_FLAGS="$$XLA_FLAGS --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 \
-    --xla_llvm_disable_expensive_passes=true"
+    --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1"
 IN_PARALLEL := -n auto --dist worksteal
 SLOWEST := --durations=10 --durations-min=1
 
