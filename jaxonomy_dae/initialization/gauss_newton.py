@@ -6,11 +6,11 @@ damps it, the damping changed as by Nielsen (1999); the nearest point weighs gue
 factorization has the tangent for the homotopy.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ..linear.arrays import triangular, where
+from ..linear.arrays import Numbers, Verdict, triangular, where
 from ..tolerances import NOISE, ZERO_WITHIN, close, solved, spacing
 from .search import Base, Descent, Equations, Judged, Linear, Look, Rung, Search
 from .sizes import row_sizes, weighed
@@ -32,10 +32,10 @@ class Descended(NamedTuple):
     point, and whether the linear model has a finite solution."""
 
     descent: Descent
-    trial: Any
-    fails: Any
-    settled: Any
-    determined: Any
+    trial: Numbers
+    fails: Verdict
+    settled: Verdict
+    determined: Verdict
 
 
 def judged_at(equations: Equations, search: Search, at: Look) -> tuple[Base, Judged]:
@@ -75,14 +75,14 @@ def judged_at(equations: Equations, search: Search, at: Look) -> tuple[Base, Jud
     return tried, Judged(finite, accepted, reached, ratio, weight, weights)
 
 
-def damping_of(equations: Equations, search: Search, judged: Judged) -> Any:
+def damping_of(equations: Equations, search: Search, judged: Judged) -> Numbers:
     """The damping of the next step of Levenberg and Marquardt."""
     damping, growth = search.descent.damping, search.descent.growth
     better = equations.xp.maximum(0.1, 1 - (2 * judged.ratio - 1) ** 3)
     return where(search.fresh, FIRST_DAMPING, damping * where(judged.accepted, better, growth))
 
 
-def linear_model(equations: Equations, search: Search, base: Base, judged: Judged, damping: Any) -> Linear:
+def linear_model(equations: Equations, search: Search, base: Base, judged: Judged, damping: Numbers) -> Linear:
     """One factorization for all rungs, of the Jacobian bordered by s and stacked on the damping; two right sides give
     the step and the tangent."""
     xp, dtype, n, m = equations.xp, equations.dtype, equations.n, len(equations.soft)
@@ -114,7 +114,7 @@ def linear_model(equations: Equations, search: Search, base: Base, judged: Judge
 
 
 def descended(
-    equations: Equations, search: Search, base: Base, judged: Judged, linear: Linear, damping: Any
+    equations: Equations, search: Search, base: Base, judged: Judged, linear: Linear, damping: Numbers
 ) -> Descended:
     """The next step of Newton's method, of Levenberg and Marquardt, or to the nearest point."""
     xp, n, eps = equations.xp, equations.n, spacing(equations.dtype)

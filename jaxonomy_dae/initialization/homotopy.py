@@ -4,9 +4,9 @@ A tangent predicts the next point of the curve, Newton steps across the tangent 
 are passed, where descent methods stop. Where the curve to one side ends, the other side is followed.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from ..linear.arrays import where
+from ..linear.arrays import Numbers, Verdict, where
 from .search import Curve, Equations, Judged, Linear, Rung, Search
 
 LIMIT = 200  # evaluations
@@ -21,14 +21,14 @@ class Followed(NamedTuple):
     is reached, and whether the curve is lost."""
 
     curve: Curve
-    foot: Any
-    trial: Any
-    rung: Any
-    landed: Any
-    fails: Any
+    foot: Numbers
+    trial: Numbers
+    rung: Numbers
+    landed: Verdict
+    fails: Verdict
 
 
-def followed(equations: Equations, search: Search, here: Any, judged: Judged, linear: Linear) -> Followed:
+def followed(equations: Equations, search: Search, here: Numbers, judged: Judged, linear: Linear) -> Followed:
     """The next point to look at on the curve, or beside it. `here` is the trial point if it was accepted."""
     xp, n, along = equations.xp, equations.n, equations.along
     fresh, old, base = search.fresh, search.curve, search.base.at

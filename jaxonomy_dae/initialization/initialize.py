@@ -86,7 +86,7 @@ def initialize(
     root: Found = jax.lax.stop_gradient(_searched(problem, solver) if found is None else found)
     # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
     good = root.method < FAILED
-    jacobian = jnp.where(good, root.jacobian, jnp.asarray(np.eye(*root.jacobian.shape), dtype))
+    jacobian = jnp.where(good, root.jacobian, jnp.asarray(np.eye(len(root.limit), len(root.x)), dtype))
     if rows.n_soft:
         w, remaining = _nearest_point(problem, root.x, jacobian, root.unit, good)
         step = None

@@ -22,11 +22,12 @@ same search runs in NumPy (`arrays.py`), and only the residual and its Jacobian 
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 from ..linear.arrays import Numbers, loop, namespace, where
@@ -59,18 +60,20 @@ class Found(NamedTuple):
     """A root, or the best point met; the Jacobian there; the largest value of each row that counts as zero; the sizes
     of the unknowns; the rung that succeeded, an index into `METHODS`."""
 
-    x: Any
-    jacobian: Any
-    limit: Any
-    unit: Any
-    method: Any
-    evaluations: Any
+    x: Numbers
+    jacobian: Numbers
+    limit: Numbers
+    unit: Numbers
+    method: Numbers
+    evaluations: Numbers
 
 
-def looking(function: Callable[[Any], Any], magnitude: Callable[[Any], Any] | None = None) -> Callable[[Any], Look]:
+def looking(
+    function: Callable[[Numbers], Numbers], magnitude: Callable[[Numbers], Numbers] | None = None
+) -> Callable[[Numbers], Look]:
     """The rows at a point, from the function F and that of the magnitudes of its terms."""
 
-    def look(x: Any) -> Look:
+    def look(x: Numbers) -> Look:
         jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(x)
         # What functions of the user's close over may be differentiated elsewhere: not in here.
         return jax.lax.stop_gradient(Look(value, jacobian, None if magnitude is None else magnitude(x)))
@@ -79,7 +82,7 @@ def looking(function: Callable[[Any], Any], magnitude: Callable[[Any], Any] | No
 
 
 def find_root(
-    look: Callable[[Any], Look],
+    look: Callable[[Numbers], Look],
     m: int,
     start: Float[Numbers, " n"],
     sizes: Sizes,
@@ -112,7 +115,8 @@ def find_root(
     if limits is not None:
         start = _inside(start, *limits, sizes.known)
 
-    def in_units(y: Any) -> Look:
+    def in_units(y: Numbers) -> Look:
+        assert unit is not None
         value, jacobian, terms = look(y * unit)
         return Look(value, jacobian * unit, terms)
 
@@ -152,15 +156,15 @@ def _climb(equations: Equations) -> Found:
     return Found(found, jacobian, limit, search.unit, method, evaluations)
 
 
-def _begun(equations: Equations, jacobian: Any, unit: Any, limit: Any, stays: Any) -> Search:
+def _begun(equations: Equations, jacobian: Numbers, unit: Numbers, limit: Numbers, stays: Numbers) -> Search:
     """Where a search begins; it is done if the point stays as it is."""
     xp, n = equations.xp, equations.n
     first = int(equations.first_rung)
 
-    def number(value: Any) -> Any:
+    def number(value: ArrayLike) -> Numbers:
         return equations.array(value)
 
-    def whole(value: Any) -> Any:
+    def whole(value: ArrayLike) -> Numbers:
         return xp.asarray(value, np.int32)
 
     origin, along, one_each = equations.origin, equations.along, xp.ones_like(limit)
@@ -246,7 +250,7 @@ def _next(
     )
 
 
-def _above(equations: Equations, search: Search) -> Any:
+def _above(equations: Equations, search: Search) -> Numbers:
     """The rung after this one, if it fails."""
     rung, last = search.rung, int(Rung.NEAREST if equations.has_soft else Rung.FAILED)
     above = where(rung == Rung.NEWTON, int(Rung.MARQUARDT), last)
@@ -261,7 +265,9 @@ def _above(equations: Equations, search: Search) -> Any:
     return above
 
 
-def _restarted(equations: Equations, search: Search, above: Any, climbs_again: Any, start: Any, here: Any) -> Any:
+def _restarted(
+    equations: Equations, search: Search, above: Numbers, climbs_again: Numbers, start: Numbers, here: Numbers
+) -> Numbers:
     """Where the next rung, or the next climb, begins."""
     xp, along, generic = equations.xp, equations.along, equations.generic
     unit, restart = xp.append(search.unit, equations.array(1.0)), start
@@ -278,7 +284,7 @@ def _restarted(equations: Equations, search: Search, above: Any, climbs_again: A
     return where(climbs_again, again, restart)
 
 
-def _off(equations: Equations, count: Any) -> Any:
+def _off(equations: Equations, count: Numbers) -> Numbers:
     """A point around a start that is not finite: closer ones first, on either side."""
     xp, known = equations.xp, equations.sizes.known
     amount = where(count % 2 == 0, 1.0, -1.0) * 10 ** (0.5 * xp.asarray(count, equations.dtype) - 4)
@@ -286,7 +292,7 @@ def _off(equations: Equations, count: Any) -> Any:
     return equations.bounded(equations.origin + amount * equations.generic * size, equations.origin)
 
 
-def _inside(x: Any, low: Any, high: Any, known: Any) -> Any:
+def _inside(x: Numbers, low: Numbers, high: Numbers, known: Numbers) -> Numbers:
     """The point moved off its bounds, into the interval."""
     xp = namespace(x)
     size = xp.maximum(known, xp.abs(x))

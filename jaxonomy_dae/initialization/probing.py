@@ -4,11 +4,11 @@ An unknown of which nothing is known, and on which nothing depends at the start 
 zero, gets its size from the powers that slopes at two distances show. Then the search begins at the start.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ..linear.arrays import where
+from ..linear.arrays import Numbers, Verdict, where
 from .search import Equations, Look, Probe, Search
 from .sizes import column_sizes
 
@@ -21,12 +21,12 @@ class Probed(NamedTuple):
     """Whether sizes are still being found; the sizes; unknowns that are flat at the start; the next trial point; the
     slopes known so far."""
 
-    goes_on: Any
-    unit: Any
-    flat: Any
-    start: Any
-    trial: Any
-    slopes: Any
+    goes_on: Verdict
+    unit: Numbers
+    flat: Numbers
+    start: Numbers
+    trial: Numbers
+    slopes: Numbers
 
 
 def probed(equations: Equations, search: Search, at: Look) -> Probed:

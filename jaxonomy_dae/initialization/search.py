@@ -3,12 +3,14 @@
 import dataclasses
 import enum
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Bool
 
-from ..linear.arrays import namespace, where
+from ..linear.arrays import Numbers, Verdict, namespace, where
 from .sizes import Sizes, soft_weight
 
 # A step that would cross a bound goes this part of the way to it: at the bound itself a root or logarithm may have no
@@ -44,9 +46,9 @@ class Look(NamedTuple):
     """The rows at a point: F, its Jacobian, and how large the terms of each row are, beside which it counts as zero;
     not finite where that is not known, None where it is known of no row. There Σ |∂F/∂x|·|x| stands for it."""
 
-    value: Any
-    jacobian: Any
-    terms: Any
+    value: Numbers
+    jacobian: Numbers
+    terms: Numbers | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,21 +61,21 @@ class Equations:
     - `origin`: where the search begins. Points are (x, s), shape (n + 1,), with s the parameter of the homotopy.
     """
 
-    look: Callable[[Any], Look]
+    look: Callable[[Numbers], Look]
     sizes: Sizes
     soft: Bool[np.ndarray, " m"]
     core: np.ndarray | None
-    limits: tuple[Any, Any] | None
-    origin: Any
-    in_units: Any
+    limits: tuple[Numbers, Numbers] | None
+    origin: Numbers
+    in_units: Verdict
 
     @property
-    def xp(self) -> Any:
+    def xp(self) -> ModuleType:
         """NumPy or JAX."""
         return namespace(self.origin)
 
     @property
-    def dtype(self) -> Any:
+    def dtype(self) -> np.dtype:
         """Of all numbers."""
         return self.origin.dtype
 
@@ -97,27 +99,27 @@ class Equations:
         """The rung that each climb begins with."""
         return Rung.NEAREST if self.nearest_first else Rung.NEWTON
 
-    def array(self, values: Any) -> Any:
+    def array(self, values: ArrayLike | list[float]) -> Numbers:
         """Numbers in the kind of the search's arrays."""
         return self.xp.asarray(values, self.dtype)
 
     @property
-    def along(self) -> Any:
+    def along(self) -> Numbers:
         """The direction of s."""
         return self.array(np.append(np.zeros(self.n), 1.0))
 
     @property
-    def generic(self) -> Any:
+    def generic(self) -> Numbers:
         """A direction of no symmetry, across which curves are followed at the start: so the first matrix is regular
         where the Jacobian is not."""
         return self.array(1.0 + 0.5 * np.cos(np.arange(1, self.n + 2)))
 
     @property
-    def weights(self) -> Any:
+    def weights(self) -> Numbers:
         """One for rows that must hold, less for guesses."""
         return self.array(np.where(self.soft, soft_weight(self.dtype), 1.0))
 
-    def bounded(self, ahead: Any, here: Any) -> Any:
+    def bounded(self, ahead: Numbers, here: Numbers) -> Numbers:
         """A step that goes most of the way to the bounds it would cross."""
         if self.limits is None:
             return ahead
@@ -134,34 +136,34 @@ class Base(NamedTuple):
     - `square`: |F|², rows weighted.
     """
 
-    at: Any
-    value: Any
-    jacobian: Any
-    limit: Any
-    holds: Any
-    square: Any
+    at: Numbers
+    value: Numbers
+    jacobian: Numbers
+    limit: Numbers
+    holds: Verdict
+    square: Numbers
 
 
 class Descent(NamedTuple):
     """Steps that lower |F|: the fraction of a Newton step; the damping of a step of Levenberg and Marquardt, its growth
     when one is rejected, and by how much the linear model says |F|² will fall; the last step to the nearest point."""
 
-    fraction: Any
-    damping: Any
-    growth: Any
-    gain: Any
-    step: Any
+    fraction: Numbers
+    damping: Numbers
+    growth: Numbers
+    gain: Numbers
+    step: Numbers
 
 
 class Curve(NamedTuple):
     """Steps along the curve of the homotopy: the length of arc, the tangent, how often the predicted point has been
     corrected, by how much the last time, and which way the curve is followed."""
 
-    arc: Any
-    tangent: Any
-    corrections: Any
-    corrected: Any
-    turn: Any
+    arc: Numbers
+    tangent: Numbers
+    corrections: Numbers
+    corrected: Numbers
+    turn: Numbers
 
 
 class Search(NamedTuple):
@@ -175,31 +177,31 @@ class Search(NamedTuple):
       on at the start.
     """
 
-    rung: Any
-    fresh: Any
-    count: Any
-    climb: Any
-    probe: Any
-    method: Any
-    evaluations: Any
-    trial: Any
-    start: Any
-    best: Any
-    first: Any
-    weight: Any
-    unit: Any
-    flat: Any
+    rung: Numbers
+    fresh: Verdict
+    count: Numbers
+    climb: Numbers
+    probe: Numbers
+    method: Numbers
+    evaluations: Numbers
+    trial: Numbers
+    start: Numbers
+    best: Numbers
+    first: Numbers
+    weight: Numbers
+    unit: Numbers
+    flat: Numbers
     base: Base
     descent: Descent
     curve: Curve
 
     @property
-    def tracking(self) -> Any:
+    def tracking(self) -> Verdict:
         """Whether the homotopy is at work."""
         return (self.rung == Rung.TRACK) | (self.rung == Rung.LAND)
 
     @property
-    def begins(self) -> Any:
+    def begins(self) -> Verdict:
         """Whether the trial point is where a climb starts."""
         return (self.probe == Probe.START) | (self.probe == Probe.SIZED)
 
@@ -208,12 +210,12 @@ class Judged(NamedTuple):
     """What a trial point is worth: whether all is finite there, whether it is accepted, whether it is a root, the ratio
     of the decrease of |F|² to that of the linear model, the weights of the rows, and what this rung makes of them."""
 
-    finite: Any
-    accepted: Any
-    reached: Any
-    ratio: Any
-    weight: Any
-    weights: Any
+    finite: Verdict
+    accepted: Verdict
+    reached: Verdict
+    ratio: Numbers
+    weight: Numbers
+    weights: Numbers
 
 
 class Linear(NamedTuple):
@@ -223,9 +225,9 @@ class Linear(NamedTuple):
     - `explained`: by how much the step lowers |F|; `extent`: the norm of the point. All in units of the unknowns.
     """
 
-    step: Any
-    tangent: Any
-    length: Any
-    stretch: Any
-    explained: Any
-    extent: Any
+    step: Numbers
+    tangent: Numbers
+    length: Numbers
+    stretch: Numbers
+    explained: Numbers
+    extent: Numbers

@@ -1,9 +1,10 @@
 """What measures unknowns and rows of initialization: so that units decide nothing."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from ..linear.arrays import Numbers, namespace
@@ -19,22 +20,24 @@ class Sizes(NamedTuple):
     soft: Float[Numbers, " m"]  # distances that weigh the same in soft rows
 
 
-def soft_weight(dtype: Any) -> float:
+def soft_weight(dtype: DTypeLike) -> float:
     """The weight of soft rows beside others: they move these by its square, a tenth of what counts as rounding."""
     return float(np.sqrt(0.1 * solved(dtype)))
 
 
-Weigh = Callable[[Any], Any]
+Weigh = Callable[[Numbers], Numbers]
 
 
-def weighed(jacobian: Any) -> Weigh:
+def weighed(jacobian: Numbers) -> Weigh:
     """Σ |∂F/∂x|·v of each row as a function of v, for a dense Jacobian."""
     xp = namespace(jacobian)
     slopes = xp.where(xp.isfinite(jacobian), xp.abs(jacobian), 0)
     return lambda v: slopes @ v
 
 
-def row_sizes(weigh: Weigh, x: Any, sizes: Sizes, unit: Any, terms: Any = None) -> tuple[Any, Any]:
+def row_sizes(
+    weigh: Weigh, x: Numbers, sizes: Sizes, unit: Numbers, terms: Numbers | None = None
+) -> tuple[Numbers, Numbers]:
     """The size of each row's terms, and the rounding that the sizes of unknowns alone let expect.
 
     **Arguments:**
@@ -52,7 +55,7 @@ def row_sizes(weigh: Weigh, x: Any, sizes: Sizes, unit: Any, terms: Any = None) 
     return size, xp.where(eps * weigh(xp.abs(x)) > DIGIT * size, 0, noise)
 
 
-def column_sizes(value: Any, jacobian: Any, sizes: Sizes, power: Any = None) -> Any:
+def column_sizes(value: Numbers, jacobian: Numbers, sizes: Sizes, power: Numbers | None = None) -> Numbers:
     """A size for every unknown: as known, or else what its rows imply, |∂F/∂xⱼ|·xⱼ being of the size of their other
     terms; 1 where nothing is known. With `power`, shape (m, n), terms are |jacobian|·xⱼ**power."""
     xp = namespace(jacobian)

@@ -100,7 +100,7 @@ def sparse_newton(
 
     def sizes_of_rows(x, values):
         slopes = jnp.where(jnp.isfinite(values), jnp.abs(values), 0)
-        return row_sizes(lambda v: rows.pattern.multiply(slopes, v), x, sizes, unit, magnitude(x))
+        return row_sizes(lambda v: rows.pattern.multiply(slopes, jnp.asarray(v)), x, sizes, unit, magnitude(x))
 
     def largest(values):
         moved = jnp.abs(values) * unit[rows.pattern.cols]
@@ -124,4 +124,4 @@ def sparse_newton(
     found = newton(look, start, (none, jnp.asarray(jnp.inf, dtype), none, jnp.array(False)), NEWTON_LIMIT, SHORTEST)
     *_, limit, holds = found.memory
     method = jnp.where(found.count > 1, METHODS.index("Newton"), 0).astype(jnp.int32)
-    return SparseFound(found.x, limit, holds, method, found.count)
+    return SparseFound(found.x, jnp.asarray(limit), holds, method, found.count)

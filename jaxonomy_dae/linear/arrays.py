@@ -1,30 +1,33 @@
 """One source for NumPy and JAX: where values are known, a search runs in NumPy, and nothing of it is compiled."""
 
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from scipy.linalg.blas import get_blas_funcs
 
 _S = TypeVar("_S")
 Numbers = jax.Array | np.ndarray
+Verdict = Numbers | np.bool_  # true or false
 
 
-def namespace(x: Any) -> Any:
+def namespace(x: object) -> ModuleType:
     """`numpy` for its own arrays and numbers, `jax.numpy` for all others."""
     return np if isinstance(x, np.ndarray | np.generic) else jnp
 
 
-def where(condition: Any, a: Any, b: Any) -> Any:
+def where(condition: Verdict | bool, a: ArrayLike, b: ArrayLike) -> Any:
     """a where the condition holds, b elsewhere; one of the two itself if the condition is one known value."""
     if not isinstance(condition, jax.Array) and np.ndim(condition) == 0:
         return a if condition else b
     return (jnp if any(isinstance(v, jax.Array) for v in (condition, a, b)) else np).where(condition, a, b)
 
 
-def triangular(r: Any, right: Any) -> Any:
+def triangular(r: Numbers, right: Numbers) -> Numbers:
     """R⁻¹ b for an upper triangular R, what is below its diagonal not being read; not finite where R is singular."""
     if namespace(r) is jnp:
         return jax.scipy.linalg.solve_triangular(r, right)
@@ -33,7 +36,7 @@ def triangular(r: Any, right: Any) -> Any:
     return trsm(1.0, r, right)
 
 
-def loop(going: Callable[[_S], Any], body: Callable[[_S], _S], state: _S) -> _S:
+def loop(going: Callable[[_S], Verdict], body: Callable[[_S], _S], state: _S) -> _S:
     """`jax.lax.while_loop`, or a loop of Python over NumPy's arrays.
 
     XLA compiles a kernel for each array that a loop carries, and each computes anew what several need: in programs,
@@ -50,11 +53,11 @@ def loop(going: Callable[[_S], Any], body: Callable[[_S], _S], state: _S) -> _S:
     for k, leaf in enumerate(leaves):
         places.setdefault(leaf.shape, []).append(k)
 
-    def packed(state: _S) -> list[Any]:
+    def packed(state: _S) -> list[jax.Array]:
         new = [jnp.asarray(leaf, dtype) for leaf in jax.tree.leaves(state)]
         return [(jnp.stack if shape else _joined)([new[k] for k in chosen]) for shape, chosen in places.items()]
 
-    def unpacked(arrays: list[Any]) -> _S:
+    def unpacked(arrays: list[jax.Array]) -> _S:
         out = list(leaves)
         for array, chosen in zip(arrays, places.values(), strict=True):
             for row, k in enumerate(chosen):
@@ -66,7 +69,7 @@ def loop(going: Callable[[_S], Any], body: Callable[[_S], _S], state: _S) -> _S:
     )
 
 
-def _joined(numbers: list[Any]) -> Any:
+def _joined(numbers: list[jax.Array]) -> jax.Array:
     """Numbers as one array, by selects: unlike a stack, these become one kernel."""
     place, out = np.arange(len(numbers)), jnp.broadcast_to(numbers[0], (len(numbers),))
     for k, number in enumerate(numbers[1:], 1):

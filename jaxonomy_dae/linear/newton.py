@@ -18,12 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .arrays import Numbers, namespace, where
+from .arrays import Verdict, namespace, where
 
 _X = TypeVar("_X")  # a point: an array, or a list of arrays of one shape
 _M = TypeVar("_M")  # a pytree
 _S = TypeVar("_S")
-Verdict = Numbers | np.bool_
 
 
 class Tried(NamedTuple, Generic[_X, _M]):

@@ -42,10 +42,11 @@ from .written_out import UNROLLED
 APART = 8  # equations of a block from which on what its phases hand on is computed once, and not where it is read
 CORRECTIONS = 2  # where an unknown of the sequence depends on another; else one is enough
 
-Entries = Mapping[tuple[int, int], Any]
+Scalar = float | jax.Array  # a number that is known, or an array of the shape of the right-hand side
+Entries = Mapping[tuple[int, int], Scalar]
 
 
-def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[Any]) -> list[Any]:
+def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[Scalar]) -> list[Scalar]:
     """x with A·x = b.
 
     **Arguments:**
@@ -67,7 +68,7 @@ def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[Any]) -> list[
         return _Elimination(tearing, {**numbers, **arrays}, right[0]).solve(right)
 
     @solved.defjvp
-    def _(primals, tangents):
+    def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[Any], list[Any]]:
         arrays, right = primals
         arrays_dot, right_dot = tangents
         still = {**numbers, **jax.lax.stop_gradient(arrays)}
@@ -78,7 +79,7 @@ def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[Any]) -> list[
             moved[e].append(-(a_dot * x[u]))
         rows = _rows({**numbers, **arrays}, n)
 
-        def times(v: Any) -> Any:
+        def times(v: jax.Array) -> jax.Array:
             parts = _parts(v)
             return jnp.stack([_total([_product(a, parts[u]) for u, a in row], parts[0]) for row in rows])
 
@@ -94,14 +95,14 @@ def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[Any]) -> list[
     return solved(arrays, list(right))
 
 
-def _parts(rows: Any) -> list[Any]:
+def _parts(rows: jax.Array) -> list[jax.Array]:
     return [rows[k] for k in range(rows.shape[0])]
 
 
 class _Elimination:
     """The factors of a torn matrix."""
 
-    def __init__(self, tearing: Tearing, matrix: dict[tuple[int, int], Any], like: Any):
+    def __init__(self, tearing: Tearing, matrix: dict[tuple[int, int], Scalar], like: jax.Array):
         self.tearing = tearing
         self.like = like
         n, m = len(tearing.sequence) + len(tearing.tearing), len(tearing.tearing)
@@ -130,7 +131,7 @@ class _Elimination:
         else:
             self.factors = dense.factor(jnp.stack([jnp.moveaxis(row, 0, -1) for row in schur], axis=-2))
 
-    def _filled(self, value: Any) -> Any:
+    def _filled(self, value: Scalar) -> Scalar:
         return jnp.broadcast_to(jnp.asarray(value, self.like.dtype), self.like.shape)
 
     def _links(self) -> int:
@@ -148,9 +149,9 @@ class _Elimination:
             links[u] = link + max((links[v] for v, _ in known), default=0)
         return max(links.values(), default=0)
 
-    def _more_than_rounding(self, schur: Any) -> Any:
+    def _more_than_rounding(self, schur: Scalar) -> Scalar:
         """The only entry of S, or not-a-number where it is what rounding left of its terms."""
-        sizes: dict[int, Any] = {self.tearing.tearing[0]: 1.0}  # |L⁻¹| |F|
+        sizes: dict[int, Scalar] = {self.tearing.tearing[0]: 1.0}  # |L⁻¹| |F|
         for e, u in self.tearing.sequence:
             terms = [_product(abs(a), sizes[v]) for v, a in self.rows[e] if v in sizes]
             sizes[u] = _product(abs(self.over_pivot[u]), _total(terms, None)) if terms else 0.0
@@ -165,7 +166,7 @@ class _Elimination:
         direct = {self.place[u]: a for u, a in self.rows[e] if u in self.place}
         through = [(a, self.w[u]) for u, a in self.rows[e] if u not in self.place and u != skip]
         if self.written_out:
-            terms: dict[int, list[Any]] = {j: [a] for j, a in direct.items()}
+            terms: dict[int, list[Scalar]] = {j: [a] for j, a in direct.items()}
             for a, w in through:
                 for j, v in w.items():
                     terms.setdefault(j, []).append(_product(a, v))
@@ -176,13 +177,13 @@ class _Elimination:
             row = row.at[np.array(list(direct))].set(values)
         return _total([row, *(_product(a, w) for a, w in through)], row)
 
-    def _along(self, u: int, z: list[Any]) -> Any:
+    def _along(self, u: int, z: list[Scalar]) -> Scalar:
         """W z of one unknown."""
         if self.written_out:
             return _total([_product(a, z[j]) for j, a in self.w[u].items()], self.like)
         return jnp.sum(self.w[u] * jnp.stack(z), axis=0)
 
-    def _schur_solve(self, s: list[Any], transposed: bool) -> list[Any]:
+    def _schur_solve(self, s: list[Scalar], transposed: bool) -> list[Scalar]:
         """S⁻¹ s or S⁻ᵀ s."""
         if self.written_out:
             m = len(s)
@@ -192,17 +193,17 @@ class _Elimination:
         solve = dense.transpose_solve if transposed else dense.solve
         return list(jnp.moveaxis(solve(self.factors, jnp.moveaxis(jnp.stack(s), 0, -1)[..., None])[..., 0], -1, 0))
 
-    def solve(self, b: Sequence[Any]) -> list[Any]:
+    def solve(self, b: Sequence[Scalar]) -> list[Scalar]:
         """A⁻¹ b."""
         tearing = self.tearing
         b = self._right(b)
         x: list[Any] = [None] * len(b)
 
-        def given(e: int, u: int) -> Any:
+        def given(e: int, u: int) -> Scalar:
             known = [_product(a, x[v]) for v, a in self.rows[e] if v != u and x[v] is not None]
             return _product(self.over_pivot[u], _less(b[e], known))
 
-        def follow(z: list[Any] | None):
+        def follow(z: list[Scalar] | None):
             for u, value in zip(tearing.tearing, z or [None] * len(tearing.tearing), strict=True):
                 x[u] = value
             for e, u in tearing.sequence:
@@ -231,13 +232,13 @@ class _Elimination:
         checked = [*tearing.residuals, *(e for e, u in tearing.sequence if _others(self.rows[e], u, self.over_pivot))]
         return self._verified(x, b, self.rows, checked)
 
-    def transpose_solve(self, g: Sequence[Any]) -> list[Any]:
+    def transpose_solve(self, g: Sequence[Scalar]) -> list[Scalar]:
         """A⁻ᵀ g: one entry for each equation."""
         tearing = self.tearing
         g = self._right(g)
         y: list[Any] = [None] * len(g)
 
-        def follow(s: Sequence[Any] | None, g: Sequence[Any] | None):
+        def follow(s: Sequence[Scalar] | None, g: Sequence[Scalar] | None):
             for e, value in zip(tearing.residuals, s or [None] * len(tearing.residuals), strict=True):
                 y[e] = value
             for e, u in reversed(tearing.sequence):
@@ -271,13 +272,15 @@ class _Elimination:
         """The number of corrections of a solution."""
         return CORRECTIONS if self.chained else 1
 
-    def _verified(self, x: list[Any], b: Sequence[Any], rows: list[list[tuple[int, Any]]], places) -> list[Any]:
+    def _verified(
+        self, x: list[jax.Array], b: Sequence[Scalar], rows: list[list[tuple[int, Scalar]]], places
+    ) -> list[Scalar]:
         """x, or not-a-number if one of the equations at `places` does not hold to rounding."""
         holds = self._hold(x, b, rows, places)
         (holds,) = self._once([holds])
         return [jnp.where(holds, v, jnp.nan) for v in x]
 
-    def _right(self, b: Sequence[Any]) -> list[Any]:
+    def _right(self, b: Sequence[Scalar]) -> list[Scalar]:
         """Right-hand sides, computed once. If XLA recomputed them for the check, one that is zero up to rounding could
         fail its own check."""
         return list(b) if self.exact else once(b)
@@ -286,7 +289,7 @@ class _Elimination:
         """The values, computed once if many expressions read them."""
         return values if self.exact else once(values, self.in_batches_only)
 
-    def _hold(self, x: list[Any], b: Sequence[Any], rows: list[list[tuple[int, Any]]], places) -> Any:
+    def _hold(self, x: list[jax.Array], b: Sequence[Scalar], rows: list[list[tuple[int, Scalar]]], places) -> Scalar:
         """True if the equations at `places` hold to rounding."""
         dtype = x[0].dtype
         eps, tiny = float(jnp.finfo(dtype).eps), float(jnp.finfo(dtype).tiny)
@@ -294,12 +297,12 @@ class _Elimination:
         if self.can_grow or len(self.tearing.tearing) > 1:
             entries = [[(v, _magnitude(a)) for v, a in row] for row in rows]
             largest = [_largest([a for _, a in row]) for row in entries]
-            units: list[list[Any]] = [[] for _ in x]  # 1 / the unit of each unknown
+            units: list[list[Scalar]] = [[] for _ in x]  # 1 / the unit of each unknown
             for row, size in zip(entries, largest, strict=True):
                 for v, a in row:
                     units[v].append(_quotient(a, size))
             norm = _largest([_product(_largest(unit), _magnitude(v)) for unit, v in zip(units, x, strict=True)])
-        holds: Any = True
+        holds: Scalar = True
         for place in places:
             products = [_product(a, x[v]) for v, a in rows[place]]
             residual = _magnitude(_less(b[place], products))
@@ -313,14 +316,14 @@ class _Elimination:
         return holds
 
 
-def _others(row: list[tuple[int, Any]], own: int, places: Container[int]) -> bool:
+def _others(row: list[tuple[int, Scalar]], own: int, places: Container[int]) -> bool:
     """True if a row has entries at some of the places, other than its own."""
     return any(v in places and v != own for v, _ in row)
 
 
-def _rows(matrix: Entries, n: int) -> list[list[tuple[int, Any]]]:
+def _rows(matrix: Entries, n: int) -> list[list[tuple[int, Scalar]]]:
     """The entries of each row, in order."""
-    rows: list[list[tuple[int, Any]]] = [[] for _ in range(n)]
+    rows: list[list[tuple[int, Scalar]]] = [[] for _ in range(n)]
     for (e, u), a in sorted(matrix.items(), key=lambda item: item[0]):
         rows[e].append((u, a))
     return rows
@@ -330,11 +333,11 @@ def _rows(matrix: Entries, n: int) -> list[list[tuple[int, Any]]]:
 # `lax`, which traces several times faster than `jnp`.
 
 
-def _magnitude(a: Any) -> Any:
+def _magnitude(a: Scalar) -> Scalar:
     return abs(a) if isinstance(a, int | float) else jax.lax.abs(a)
 
 
-def _largest(values: Sequence[Any]) -> Any:
+def _largest(values: Sequence[Scalar]) -> Scalar:
     """The largest of some magnitudes."""
     numbers = [v for v in values if isinstance(v, int | float)]
     arrays = [v for v in values if not isinstance(v, int | float)]
@@ -344,35 +347,38 @@ def _largest(values: Sequence[Any]) -> Any:
     return jnp.maximum(total, max(numbers)) if numbers and max(numbers) > 0 else total
 
 
-def _quotient(a: Any, b: Any) -> Any:
+def _quotient(a: Scalar, b: Scalar) -> Scalar:
     if isinstance(a, int | float) and isinstance(b, int | float) and b:
         return a / b
     return _binary(jax.lax.div, jnp.true_divide, a, b)
 
 
-def _product(a: Any, x: Any) -> Any:
+def _product(a: Scalar, x: Scalar) -> Scalar:
     if isinstance(a, int | float):
         return x if a == 1 else _negative(x) if a == -1 else a * x
     return x * a if isinstance(x, int | float) else _binary(jax.lax.mul, jnp.multiply, a, x)
 
 
-def _negative(x: Any) -> Any:
+def _negative(x: Scalar) -> Scalar:
     return -x if isinstance(x, int | float) else jax.lax.neg(x)
 
 
-def _less(value: Any, terms: list[Any]) -> Any:
+def _less(value: Scalar, terms: list[Scalar]) -> Scalar:
     for term in terms:
         value = _binary(jax.lax.sub, jnp.subtract, value, term)
     return value
 
 
-def _total(terms: list[Any], like: Any) -> Any:
+def _total(terms: list[Scalar], like: jax.Array | None) -> Scalar:
     if not terms:
+        assert like is not None
         return jnp.zeros_like(like)
     return functools.reduce(lambda total, term: _binary(jax.lax.add, jnp.add, total, term), terms)
 
 
-def _binary(on_arrays: Callable[[Any, Any], Any], on_all: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
+def _binary(
+    on_arrays: Callable[[Scalar, Scalar], Scalar], on_all: Callable[[Scalar, Scalar], Scalar], a: Scalar, b: Scalar
+) -> Scalar:
     """An operation, in `lax` where both operands are arrays of one shape."""
     alike = isinstance(a, jax.Array) and isinstance(b, jax.Array) and a.shape == b.shape and a.dtype == b.dtype
     return on_arrays(a, b) if alike else on_all(a, b)
