@@ -30,7 +30,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from ..linear.arrays import Numbers, loop, namespace, where
+from ..linear.arrays import Numbers, Verdict, loop, namespace, where
 from ..tolerances import close, solved
 from . import gauss_newton, homotopy
 from .probing import Probed, probed
@@ -156,7 +156,7 @@ def _climb(equations: Equations) -> Found:
     return Found(found, jacobian, limit, search.unit, method, evaluations)
 
 
-def _begun(equations: Equations, jacobian: Numbers, unit: Numbers, limit: Numbers, stays: Numbers) -> Search:
+def _begun(equations: Equations, jacobian: Numbers, unit: Numbers, limit: Numbers, stays: Verdict) -> Search:
     """Where a search begins; it is done if the point stays as it is."""
     xp, n = equations.xp, equations.n
     first = int(equations.first_rung)
@@ -250,7 +250,7 @@ def _next(
     )
 
 
-def _above(equations: Equations, search: Search) -> Numbers:
+def _above(equations: Equations, search: Search) -> ArrayLike:
     """The rung after this one, if it fails."""
     rung, last = search.rung, int(Rung.NEAREST if equations.has_soft else Rung.FAILED)
     above = where(rung == Rung.NEWTON, int(Rung.MARQUARDT), last)
@@ -266,7 +266,7 @@ def _above(equations: Equations, search: Search) -> Numbers:
 
 
 def _restarted(
-    equations: Equations, search: Search, above: Numbers, climbs_again: Numbers, start: Numbers, here: Numbers
+    equations: Equations, search: Search, above: ArrayLike, climbs_again: ArrayLike, start: Numbers, here: Numbers
 ) -> Numbers:
     """Where the next rung, or the next climb, begins."""
     xp, along, generic = equations.xp, equations.along, equations.generic
@@ -284,7 +284,7 @@ def _restarted(
     return where(climbs_again, again, restart)
 
 
-def _off(equations: Equations, count: Numbers) -> Numbers:
+def _off(equations: Equations, count: Numbers | np.integer | int) -> Numbers:
     """A point around a start that is not finite: closer ones first, on either side."""
     xp, known = equations.xp, equations.sizes.known
     amount = where(count % 2 == 0, 1.0, -1.0) * 10 ** (0.5 * xp.asarray(count, equations.dtype) - 4)

@@ -196,12 +196,12 @@ class Search(NamedTuple):
     curve: Curve
 
     @property
-    def tracking(self) -> Verdict:
+    def tracking(self) -> Verdict | bool:
         """Whether the homotopy is at work."""
         return (self.rung == Rung.TRACK) | (self.rung == Rung.LAND)
 
     @property
-    def begins(self) -> Verdict:
+    def begins(self) -> Verdict | bool:
         """Whether the trial point is where a climb starts."""
         return (self.probe == Probe.START) | (self.probe == Probe.SIZED)
 

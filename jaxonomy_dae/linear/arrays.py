@@ -20,7 +20,7 @@ def namespace(x: object) -> ModuleType:
     return np if isinstance(x, np.ndarray | np.generic) else jnp
 
 
-def where(condition: Verdict | bool, a: ArrayLike, b: ArrayLike) -> Any:
+def where(condition: ArrayLike, a: ArrayLike, b: ArrayLike) -> Any:
     """a where the condition holds, b elsewhere; one of the two itself if the condition is one known value."""
     if not isinstance(condition, jax.Array) and np.ndim(condition) == 0:
         return a if condition else b

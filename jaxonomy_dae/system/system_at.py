@@ -7,18 +7,21 @@ systems are traced on scalars, which XLA fuses into a few kernels; large ones on
 import functools
 import operator
 from collections.abc import Sequence
-from typing import Any
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from jax import Array
 
+from ..aliases import Args, Time
 from ..errors import ModelError
+from ..linear.arrays import Numbers
 from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve
-from ..lowering.gather import SCALARS, Gather, entries, times
+from ..lowering.gather import SCALARS, Chunk, Gather, entries, times
 from ..lowering.plan import PlannedRow, SystemPlan
 from ..lowering.plan_events import EventPlan, HeldPlan
 from ..lowering.program import Program
@@ -36,7 +39,7 @@ from .roots import newton
 class SystemAt:
     """A system at one time and state, ready to be evaluated."""
 
-    def __init__(self, plan: SystemPlan, parameters: Any, networks: tuple, t: Any, inputs: Any, typical: Any):
+    def __init__(self, plan: SystemPlan, parameters: Array, networks: tuple, t: Time, inputs: Args, typical: Array):
         """`typical` are the sizes of all quantities, shape (quantities,)."""
         self.plan = plan
         self.typical = jax.lax.stop_gradient(typical)
@@ -45,16 +48,16 @@ class SystemAt:
         self.networks = networks
         self.inputs = inputs
         self.t = on_device(t, self.dtype)
-        self._last: tuple[Any, Any] | None = None  # the state that was asked for last, and its chunk
+        self._last: tuple[Array, Chunk] | None = None  # the state that was asked for last, and its chunk
 
-    def run(self, program: Program, x: Any, refine: Refinement, t: Any = None) -> Evaluation:
+    def run(self, program: Program, x: Chunk, refine: Refinement, t: Time = None) -> Evaluation:
         """Evaluates a program at a state."""
         t = self.t if t is None else t
         inputs = input_values(self.plan, self.inputs, t, self.dtype)
         networks = Networks(self.networks)
         return Evaluation(self._chunk(x), inputs, self.parameters, t, networks, self.typical).run(program, refine)
 
-    def _chunk(self, x: Any) -> Any:
+    def _chunk(self, x: Chunk) -> Chunk:
         """The state as a tuple of scalars, if it is one or has up to `SCALARS` entries; else as an array."""
         if isinstance(x, tuple):
             return x
@@ -65,7 +68,7 @@ class SystemAt:
             self._last = (x, tuple(entries(array)) if self.plan.n_state <= SCALARS else array)
         return self._last[1]
 
-    def _read(self, evaluation: Evaluation, gather: Gather) -> Any:
+    def _read(self, evaluation: Evaluation, gather: Gather) -> Array:
         """Gathered values as an array; those of a small system one by one, which XLA fuses."""
         n = len(gather.chunk)
         if not 0 < n <= SCALARS or self.plan.n_state > SCALARS:
@@ -74,7 +77,7 @@ class SystemAt:
 
     # --- vector field ------------------------------------------------------------------------------------------
 
-    def vector_field(self, x: Any) -> Any:
+    def vector_field(self, x: Array) -> Array:
         """d(state)/dt, shape (n_state,)."""
         plan = self.plan
         if not len(plan.carried):
@@ -85,12 +88,12 @@ class SystemAt:
             return jnp.concatenate([slopes, self._read(evaluation, plan.carried_rates)])
         return jnp.concatenate([slopes, self._carried_rates(x, slopes)])
 
-    def semi_explicit(self, x: Any) -> Any:
+    def semi_explicit(self, x: Array) -> Array:
         """dx/dt of the states, then the residuals of nonlinear blocks, at the state as it is: shape (n_state,)."""
         slopes, _ = self._slopes(x)
         return jnp.concatenate([slopes, self.carried_vector(self.t, x)]) if len(self.plan.carried) else slopes
 
-    def _slopes(self, x: Any) -> tuple[Any, Evaluation]:
+    def _slopes(self, x: Array) -> tuple[Array, Evaluation]:
         """dx/dt of the differential states, and all that was computed on the way."""
         plan = self.plan
         evaluation = self.run(plan.derivative, x, Refinement.NONE)
@@ -99,7 +102,7 @@ class SystemAt:
             slopes = slopes + self._correction(row, evaluation)
         return slopes, evaluation
 
-    def _correction(self, row: PlannedRow, evaluation: Evaluation) -> Any:
+    def _correction(self, row: PlannedRow, evaluation: Evaluation) -> Array:
         """What a network adds to the slopes."""
         read = iter(row.inputs)
         u = [
@@ -111,12 +114,12 @@ class SystemAt:
         place[list(row.rows)] = np.arange(len(row.rows))
         return jnp.append(out[: len(row.rows)] / jnp.asarray(row.factor, self.dtype), 0.0)[place]
 
-    def _carried_rates(self, x: Any, slopes: Any) -> Any:
+    def _carried_rates(self, x: Array, slopes: Array) -> Array:
         """dz/dt = −(∂g/∂z)⁻¹ (∂g/∂t + ∂g/∂x dx/dt) for the tearing variables z of nonlinear blocks."""
         plan = self.plan
         n, m = len(plan.states), len(plan.carried)
 
-        def along(rates: Any) -> Any:
+        def along(rates: Array) -> Array:
             moved = jnp.ones_like(self.t), jnp.concatenate([slopes, rates])
             return jax.jvp(self.carried_vector, (self.t, x), moved)[1]
 
@@ -129,11 +132,11 @@ class SystemAt:
         rest = along(jnp.zeros(m, self.dtype))
         return -solve_whole(plan.carried_pattern, matrix, rest, solver=plan.linear_solver)
 
-    def carried_vector(self, t: Any, x: Any) -> Any:
+    def carried_vector(self, t: Array, x: Array) -> Array:
         """The residuals of nonlinear blocks at the tearing variables in the state, shape (carried,)."""
         return self._joined(self.run(self.plan.carried_residuals, x, Refinement.NONE, t=t).residuals)
 
-    def block_determinants(self, x: Any) -> Any:
+    def block_determinants(self, x: Array) -> Array:
         """det ∂g/∂z of every nonlinear block that is written out, shape (blocks,)."""
         plan = self.plan
         n, m = len(plan.states), len(plan.carried)
@@ -156,7 +159,7 @@ class SystemAt:
                 found.append(entries[np.asarray(place[rows.ravel(), columns.ravel()]).reshape(rows.shape) - 1])
         return jnp.concatenate([b[:, 0, 0] if b.shape[-1] == 1 else jnp.linalg.det(b) for b in found])
 
-    def dummy_determinants(self, x: Any) -> Any:
+    def dummy_determinants(self, x: Array) -> Array:
         """det ∂g/∂z of every block that determines dummy derivatives z, each equation g = 0 in units of its gradient
         with respect to all states, shape (blocks,). Zero where the choice of states is singular."""
         plan = self.plan
@@ -188,7 +191,7 @@ class SystemAt:
         found = [matrix[b.rows[:, :, None], b.columns[:, None, :]] for b in plan.dummy_blocks]
         return jnp.concatenate([b[:, 0, 0] if b.shape[-1] == 1 else jnp.linalg.det(b) for b in found])
 
-    def refined(self, x: Any, refine: Refinement) -> Any:
+    def refined(self, x: Array, refine: Refinement) -> Array:
         """The state after Newton corrections of the tearing variables of nonlinear blocks, block by block;
         not-a-number where these blocks' equations do not hold then."""
         plan = self.plan
@@ -198,17 +201,17 @@ class SystemAt:
 
     # --- constraints -------------------------------------------------------------------------------------------
 
-    def _constraints(self, x: Any) -> list[Any]:
+    def _constraints(self, x: Chunk) -> list[Array]:
         """The hidden constraints' residuals, one array for each template: scalars, or shape (instances,)."""
         evaluation = self.run(self.plan.constraint_program, x, Refinement.NONE)
         found = (evaluation.equation(planned) for planned in self.plan.constraints)
         return [at.filled(at.residual()) for at in found]
 
-    def constraint_vector(self, x: Any) -> Any:
+    def constraint_vector(self, x: Array) -> Array:
         """All hidden constraints' residuals, shape (n_constraints,)."""
         return self._joined(self._constraints(x))
 
-    def _joined(self, parts: Sequence[Any]) -> Any:
+    def _joined(self, parts: Sequence[Array]) -> Array:
         return jnp.concatenate([jnp.reshape(v, (-1,)) for v in parts]) if parts else jnp.zeros((0,), self.dtype)
 
     # --- magnitudes --------------------------------------------------------------------------------------------
@@ -216,43 +219,43 @@ class SystemAt:
     # How large the terms are of which something is computed, where `sizes` are those of the state's entries, shape
     # (n_state,), |x| at least. Not differentiated.
 
-    def _measured(self, program: Program, x: Any, sizes: Any) -> Measured:
+    def _measured(self, program: Program, x: Array, sizes: Array) -> Measured:
         inputs = input_values(self.plan, self.inputs, self.t, self.dtype)
         networks = Networks(self.networks)
         return Measured(
             self._chunk(x), self._chunk(sizes), inputs, self.parameters, self.t, networks, self.typical
         ).run(program, Refinement.NONE)
 
-    def constraint_magnitudes(self, x: Any, sizes: Any) -> Any:
+    def constraint_magnitudes(self, x: Array, sizes: Array) -> Array:
         """The magnitudes of the hidden constraints' terms, shape (n_constraints,)."""
         evaluation = self._measured(self.plan.constraint_program, x, sizes)
         return self._joined([evaluation.terms_of(evaluation.equation(planned)) for planned in self.plan.constraints])
 
-    def carried_magnitudes(self, x: Any, sizes: Any) -> Any:
+    def carried_magnitudes(self, x: Array, sizes: Array) -> Array:
         """The magnitudes of the terms of nonlinear blocks, shape (carried,)."""
         return self._joined(self._measured(self.plan.carried_residuals, x, sizes).carried_magnitudes)
 
-    def magnitudes(self, x: Any, sizes: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
+    def magnitudes(self, x: Array, sizes: Array, quantity: np.ndarray, factor: np.ndarray) -> Array:
         """The magnitudes of quantities with factors, shape (len(quantity),); infinite or not-a-number where it is not
         known."""
         program = self.plan.reading(quantity)
         found = self._measured(program, x, sizes).size(program.layout.gather(quantity, factor))
         return jnp.broadcast_to(jnp.asarray(found, self.dtype), (len(quantity),))
 
-    def slope_magnitudes(self, x: Any, sizes: Any) -> Any:
+    def slope_magnitudes(self, x: Array, sizes: Array) -> Array:
         """The magnitudes of the states' slopes, shape (states,); infinite or not-a-number where it is not known."""
         plan = self.plan
         found = self._measured(plan.derivative, x, sizes).size(plan.next_derivative)
         return jnp.broadcast_to(jnp.asarray(found, self.dtype), (len(plan.states),))
 
-    def held(self, x: Any) -> tuple[Any, Any]:
+    def held(self, x: Array) -> tuple[Array, Array]:
         """For the constraints that come and go with modes: (1.0 where one holds, 0.0 otherwise, shape (held,); all
         levels, shape (levels,), which are zero while it does)."""
         plan = self._held()
         active = self._filled(self.run(plan.active_program, x, Refinement.NONE), plan.active)
         return active, self._filled(self.run(plan.level_program, x, Refinement.ONCE), plan.level)
 
-    def held_forces(self, x: Any) -> Any:
+    def held_forces(self, x: Array) -> Array:
         """The forces of the constraints that only push, shape (held,), zero for all others."""
         plan = self._held()
         return self._filled(self.run(plan.force_program, x, Refinement.ONCE), plan.force)
@@ -262,7 +265,7 @@ class SystemAt:
             raise ModelError("no constraint of this system comes and goes with modes")
         return self.plan.held
 
-    def projected_onto(self, x: Any) -> Any:
+    def projected_onto(self, x: Array) -> Array:
         """All residuals that states are projected onto: zero, whatever the state, where a mode does not ask for one."""
         residuals = self.constraint_vector(x)
         if self.plan.held is None:
@@ -271,7 +274,7 @@ class SystemAt:
         holds = active[self.plan.held.table.owner] > 0
         return jnp.concatenate([residuals, jnp.where(holds, levels, 0.0)])
 
-    def project(self, x: Any, iterations: int) -> Any:
+    def project(self, x: Array, iterations: int) -> Array:
         """The state moved onto the hidden constraints, and onto those of the modes at hand, by Gauss–Newton steps of
         least (nominal-weighted) norm, and the tearing variables of nonlinear blocks refined."""
         plan = self.plan
@@ -285,7 +288,7 @@ class SystemAt:
             x = self.refined(x, Refinement.ONCE if iterations == 1 else Refinement.ROOT)
         return x
 
-    def _least_norm_step(self, x: Any) -> Any:
+    def _least_norm_step(self, x: Array) -> Array:
         plan = self.plan
         n = len(plan.states)
         if plan.n_state <= SCALARS and plan.n_constraints <= UNROLLED and plan.held is None:
@@ -305,7 +308,7 @@ class SystemAt:
         multiplier = jnp.linalg.solve(gram if absent is None else gram + jnp.diag(absent), value)
         return jnp.concatenate([x[:n] - nominal * (multiplier @ jacobian), x[n:]])
 
-    def _least_norm_of_few(self, state: tuple) -> Any:
+    def _least_norm_of_few(self, state: Chunk) -> Array:
         """As `_least_norm_step` on scalars, which XLA fuses: products of small matrices take a pendulum three times as
         long, alone and in batches."""
         plan = self.plan
@@ -337,27 +340,27 @@ class SystemAt:
 
     # --- events ------------------------------------------------------------------------------------------------
 
-    def guards(self, x: Any) -> Any:
+    def guards(self, x: Array) -> Array:
         """The guards of all events of conditions, shape (guards,)."""
         events = self._events()
         evaluation = self.run(events.guards, x, Refinement.ONCE)
         return self._filled(evaluation, events.guard)
 
-    def event_values(self, x: Any) -> Any:
+    def event_values(self, x: Array) -> Array:
         """The values that the actions of all events would write, shape (actions,)."""
         events = self._events()
         read = self._filled(self.run(events.values, x, Refinement.ROOT), events.value)
         return jnp.where(events.table.value < 0, jnp.asarray(events.table.constant, self.dtype), read)
 
-    def clocks(self) -> tuple[Any, Any]:
+    def clocks(self) -> tuple[Numbers, Numbers]:
         """Periods and offsets of sampled events, shape (clocks,) each; infinite periods of those that happen once."""
         clocks = [event.clock for event in self._events().table.events if event.clock is not None]
         periods, offsets = zip(*clocks, strict=True) if clocks else ((), ())
         return self._computed(periods), self._computed(offsets)
 
-    def _computed(self, starts: Sequence[Start | None]) -> Any:
+    def _computed(self, starts: Sequence[Start | None]) -> Numbers:
         """Expressions in parameters, those that are alike at once; infinity for None."""
-        values: Any = np.full((len(starts),), np.inf, self.dtype)
+        values: Numbers = np.full((len(starts),), np.inf, self.dtype)
         known = not is_traced((self.parameters, self.t))
         numbers, t = (np.asarray(self.parameters), np.asarray(self.t)) if known else (self.parameters, self.t)
         values = values if known else jnp.asarray(values)
@@ -365,14 +368,14 @@ class SystemAt:
             values = group.put(values, numbers, t)
         return values
 
-    def waves(self, differentiated: bool = False) -> tuple[Any, Any]:
+    def waves(self, differentiated: bool = False) -> tuple[Array, Array]:
         """Angular frequencies and phases of what drives the model, shape (waves,) each; NaN for phases that move. Where
         parameters are known, waves on which nothing depends, as those of amplitude zero, have the frequency zero.
         Derivatives by the amplitude need steps that see the wave: where they are `differentiated` or traced, all
         waves count."""
         frequencies, phases = [], []
         known = not is_traced((self.parameters, self.t))
-        xp: Any = np if known else jnp
+        xp: ModuleType = np if known else jnp
         numbers, t = (np.asarray(self.parameters), np.asarray(self.t)) if known else (self.parameters, self.t)
         for group in self.plan.waves:
             n = len(group.parameter)
@@ -394,7 +397,7 @@ class SystemAt:
             raise ModelError("this system has no events")
         return self.plan.events
 
-    def _filled(self, evaluation: Evaluation, gather: Gather) -> Any:
+    def _filled(self, evaluation: Evaluation, gather: Gather) -> Array:
         n = len(gather.chunk)
         if not n:
             return jnp.zeros((0,), self.dtype)
@@ -402,11 +405,11 @@ class SystemAt:
 
     # --- reading -----------------------------------------------------------------------------------------------
 
-    def quantities(self, x: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
+    def quantities(self, x: Array, quantity: np.ndarray, factor: np.ndarray) -> Array:
         """The values of quantities with factors, shape (len(quantity),)."""
         program = self.plan.reading(quantity)
         return self._filled(self.run(program, x, Refinement.ROOT), program.layout.gather(quantity, factor))
 
 
-def _sum(terms: list[Any], zero: Any) -> Any:
+def _sum(terms: list[Array], zero: Array | float) -> Array | float:
     return functools.reduce(operator.add, terms) if terms else zero
