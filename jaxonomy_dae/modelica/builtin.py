@@ -169,6 +169,7 @@ FUNCTIONS: dict[str, Callable[..., Value]] = {
     "product": product,
     "size": _size,
     "ndims": lambda a: len(sizes(a)),
+    "array": lambda *entries: list(entries),
     "fill": filled,
     "zeros": lambda *n: filled(0.0, *n),
     "ones": lambda *n: filled(1.0, *n),

@@ -8,13 +8,17 @@ from typing import Any
 
 from ..errors import ModelError, nearest
 from ..optional import optional_module
+from .complete import completed
 from .flat_model import FlatModel, flat_of
+from .left_out import LEFT_OUT
+from .library import Library
 from .read_base import read_base, read_modifiers
 from .read_rumoca import read_rumoca
 
 _PLACE = re.compile(r"× (?P<what>[^\n]*)\s+╭─\[[^\]]*?:(?P<line>\d+):(?P<column>\d+)\]")
 _UNRESOLVED = re.compile(r"unresolved (type reference|function call|component reference|[\w ]+): '([^']+)'")
 _UNBALANCED = re.compile(r"unbalanced model: (\d+) equations, (\d+) unknowns")
+DEFINED = frozenset(LEFT_OUT)  # functions that texts need not hold
 _CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")
 
 
@@ -22,13 +26,14 @@ def load(source: str | Path, model: str | None = None, roots: Sequence[str | Pat
     """Reads a model in Base Modelica, or in Modelica.
 
     Base Modelica is read without other packages. Modelica source is flattened by rumoca (extra `modelica`): files
-    `.mo` that do not begin with `//! base`, and whatever `model` or `roots` is given for.
+    `.mo` that do not begin with `//! base`, and whatever `model` is given for, or `roots` without that beginning.
 
     **Arguments:**
 
     - `source`: the path of a file, or the text itself.
     - `model`: the full name of the model, such as `"Circuits.RC"`; the only one of the source if left out.
-    - `roots`: folders or files of the libraries that a model in Modelica uses.
+    - `roots`: folders or files of the libraries that a model in Modelica uses. For Base Modelica, the folders where
+        functions and records are defined that the text calls but does not hold.
 
     **Raises:**
 
@@ -38,9 +43,11 @@ def load(source: str | Path, model: str | None = None, roots: Sequence[str | Pat
     """
     is_text = isinstance(source, str) and ("\n" in source or not source.endswith((".bmo", ".mo")))
     text = str(source) if is_text else Path(source).read_text(encoding="utf-8")
-    is_modelica = not is_text and str(source).endswith(".mo") and not text.startswith("//! base")
-    if model is None and not roots and not is_modelica:
-        return flat_of(read_base(text))
+    is_base = text.startswith("//! base")
+    is_modelica = not is_text and str(source).endswith(".mo") and not is_base
+    if model is None and (is_base or not roots) and not is_modelica:
+        flat = flat_of(read_base(text))
+        return completed(flat, Library(roots), DEFINED) if roots else flat
     return _by_rumoca(text, None if is_text else Path(source), model, roots)
 
 

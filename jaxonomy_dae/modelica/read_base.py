@@ -50,12 +50,12 @@ _NOT, _SUM, _POWER = 3, 5, 7
 INSIDE = "[\\'"  # a quoted name with names in its subscripts
 _QUOTED = r"'(?:[^'\\]|\\.)*'"
 _PART = re.compile(rf"([^\[\]]+)(?:\[((?:{_QUOTED}|\[(?:{_QUOTED}|[^\[\]'])*\]|[^\[\]'])*)\])?\.?")
-_PREFIXES = frozenset(
+PREFIXES = frozenset(
     "parameter constant discrete input output final flow stream inner outer each protected public".split()
 )
-_CLASS = ("model", "record", "function", "type", "package", "class", "block", "connector")
+CLASSES = ("model", "record", "function", "type", "package", "class", "block", "connector")
 _BEFORE_CLASS = ("pure", "impure", "operator", "partial", "encapsulated", "final", "expandable")
-_SECTION_ENDS = ("end", "equation", "algorithm", "initial", "external", "protected", "public", "annotation")
+SECTION_ENDS = ("end", "equation", "algorithm", "initial", "external", "protected", "public", "annotation")
 
 
 def read_base(text: str) -> Class:
@@ -65,12 +65,12 @@ def read_base(text: str) -> Class:
 
     - `ModelError` for what is not Base Modelica, with line and column.
     """
-    return _Reader(text).file()
+    return Reader(text).file()
 
 
 def read_modifiers(text: str) -> dict[str, Any]:
     """What stands in parentheses behind a name, such as `(StopTime = 2.0)`."""
-    return _Reader(text).modifiers()
+    return Reader(text).modifiers()
 
 
 def written(name: str) -> Reference:
@@ -79,11 +79,11 @@ def written(name: str) -> Reference:
     subscripts: list[tuple[Expression, ...]] = []
     for part, inside in _PART.findall(re.sub(r"\\(.)", r"\1", name)):
         parts.append(part)
-        subscripts.append(_Reader(f"[{inside}]")._subscripts() if inside else ())
+        subscripts.append(Reader(f"[{inside}]")._subscripts() if inside else ())
     return Reference(tuple(parts), tuple(subscripts))
 
 
-class _Reader:
+class Reader:
     def __init__(self, text: str):
         self.text = text
         self.kinds: list[str] = []
@@ -385,7 +385,7 @@ class _Reader:
     def declaration(self) -> Declaration:
         line = self.line()
         prefixes = set()
-        while self.kinds[self.i] == "word" and self.words[self.i] in _PREFIXES:
+        while self.kinds[self.i] == "word" and self.words[self.i] in PREFIXES:
             prefixes.add(self.words[self.i])
             self.i += 1
         kind = self.name()
@@ -412,7 +412,7 @@ class _Reader:
     def definition(self) -> Class:
         while self.take(*_BEFORE_CLASS):
             pass
-        kind = self.take(*_CLASS)
+        kind = self.take(*CLASSES)
         if not kind:
             self._fail("expected a class, such as package, model or function")
         name = self.name()
@@ -433,7 +433,7 @@ class _Reader:
             self.need(";")
         else:
             line = self.line()
-            prefixes = frozenset(iter(lambda: self.take(*_PREFIXES), ""))
+            prefixes = frozenset(iter(lambda: self.take(*PREFIXES), ""))
             of = self.name()
             while self.take("."):
                 of += "." + self.name()
@@ -462,7 +462,7 @@ class _Reader:
             if start:
                 self.i += 1
             if section := self.take("equation", "algorithm"):
-                sections[start + section].append(self.statements(*_SECTION_ENDS))
+                sections[start + section].append(self.statements(*SECTION_ENDS))
             elif self.take("annotation"):
                 annotation = self.modifiers()
                 self.need(";")
@@ -489,7 +489,7 @@ class _Reader:
         i = self.i
         while self.keys[i] in _BEFORE_CLASS:
             i += 1
-        return self.keys[i] in _CLASS and self.kinds[i + 1] in ("word", "quoted")
+        return self.keys[i] in CLASSES and self.kinds[i + 1] in ("word", "quoted")
 
     def _external(self) -> str:
         """The name of the called function; its arguments are left out."""

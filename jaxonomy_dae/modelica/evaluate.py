@@ -1,0 +1,350 @@
+"""Evaluates Modelica expressions over symbols: what is constant is computed, the rest becomes SymPy."""
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
+
+import sympy
+
+from ..errors import ModelError
+from ..modeling.symbols import VariableSymbol, der
+from .builtin import FUNCTIONS, matrix_product
+from .flat_model import literal_numbers
+from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
+from .tree import (
+    Array,
+    Binary,
+    Call,
+    Choice,
+    Class,
+    Comprehension,
+    End,
+    Expression,
+    Matrix,
+    Number,
+    Part,
+    Range,
+    Reference,
+    Several,
+    Text,
+    Truth,
+    Unary,
+    Whole,
+)
+from .values import Record, Results, Value, both, chosen, either, entrywise, is_condition, negated
+
+Names = Callable[[str], Value]  # the value of a name; raises KeyError for an unknown one
+
+
+class Evaluator:
+    """Evaluates the expressions of a flat model. `call` carries out functions.
+
+    - `classes`: functions, records and enumerations, by name.
+    - `names`: what a name of the model means.
+    - `special`: calls that only the model can answer, such as `pre`, by name: from the arguments as written.
+    - `externals`: functions in place of those that are written in C, by name.
+    - `named`: gives an expression of a function a name, so that what is read several times stands once.
+    - `entries`: the places of the entries that are declared one by one, by the name of their array.
+    """
+
+    def __init__(
+        self,
+        classes: Mapping[str, Class],
+        names: Names,
+        special: Mapping[str, Callable[..., Value]],
+        externals: Mapping[str, Callable[..., Value]],
+        entries: Mapping[str, list[tuple[int, ...]]] | None = None,
+        named: Callable[[sympy.Expr], Value] = lambda e: e,
+    ):
+        self.classes, self.names, self.entries = classes, names, entries or {}
+        self.special, self.externals = special, externals
+        self.literals = literal_numbers(classes)
+        self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
+        self.quieted: set[sympy.Basic] = set()  # conditions that stood in noEvent
+        self.named = named
+        self.depth = 0
+        self.guards: list[Value] = []  # conditions that are not constant, around what is carried out
+
+    # --- expressions -------------------------------------------------------------------------------------------------
+
+    def evaluate(self, e: Expression, names: Names | None = None) -> Value:
+        """The value of an expression, with `names` in place of the model's; the first result of a function."""
+        value = self.results(e, names)
+        return value[0] if isinstance(value, Results) else value
+
+    def results(self, e: Expression, names: Names | None = None) -> Value:
+        """As `evaluate`, but all results of a function."""
+        return _EVALUATED[type(e)](self, e, names or self.names)
+
+    def _reference(self, e: Reference, names: Names) -> Value:
+        path = e.path
+        if path in self.literals:
+            return self.literals[path]
+        if not any(e.subscripts):
+            try:
+                return names(path)
+            except KeyError:
+                pass
+        return self._by_parts(e, names)
+
+    def _by_parts(self, e: Reference, names: Names) -> Value:
+        """A reference into an array or record: the longest beginning that has a name, then fields and subscripts."""
+        if any(e.subscripts):
+            written = self._entry_name(e, names)
+            if written is not None:
+                try:
+                    return names(written)
+                except KeyError:
+                    pass
+        for n in range(len(e.parts), 0, -1):
+            try:
+                value = names(".".join(e.parts[:n]))
+            except KeyError:
+                continue
+            if any(e.subscripts[: n - 1]):
+                continue
+            value = self._entry(value, e.subscripts[n - 1], names)
+            for field, subscripts in zip(e.parts[n:], e.subscripts[n:], strict=True):
+                value = self._entry(_field(value, field), subscripts, names)
+            return value
+        raise ModelError(f"'{e.path}' is not declared")
+
+    def name_of(self, e: Reference) -> str:
+        """The name of a variable that is declared by itself, an entry of an array among them."""
+        return (self._entry_name(e, self.names) if any(e.subscripts) else None) or e.path
+
+    def _entry_name(self, e: Reference, names: Names) -> str | None:
+        """The name of an entry that is declared by itself, as 'x[2].y'."""
+        out = []
+        for part, subscripts in zip(e.parts, e.subscripts, strict=True):
+            try:
+                numbers = [self.constant(s, names) for s in subscripts if not isinstance(s, Whole | End)]
+            except (ModelError, KeyError):
+                return None
+            if len(numbers) != len(subscripts) or not all(isinstance(n, int) for n in numbers):
+                return None
+            out.append(f"{part}[{','.join(map(str, numbers))}]" if numbers else part)
+        return ".".join(out)
+
+    def _entry(self, value: Value, subscripts: tuple[Expression, ...], names: Names) -> Value:
+        if not subscripts:
+            return value
+        if not isinstance(value, list):
+            raise ModelError(f"{value!r} is not an array, but has a subscript")
+        first, *rest = subscripts
+        if isinstance(first, Whole):
+            chosen_rows: Value = value
+        else:
+            index = self.evaluate(first, with_end(names, len(value)))
+            if isinstance(index, list):
+                chosen_rows = [value[index_of(k, len(value))] for k in index]
+            elif isinstance(index, int | float):
+                return self._entry(value[index_of(index, len(value))], tuple(rest), names)
+            else:
+                return self._by_choice(value, index, tuple(rest), names)
+        return [self._entry(row, tuple(rest), names) for row in chosen_rows]
+
+    def _by_choice(self, value: list, index: Value, rest: tuple, names: Names) -> Value:
+        """The entry of an array whose subscript is not constant."""
+        entries = [self._entry(row, rest, names) for row in value]
+        out = entries[-1]
+        for k in range(len(entries) - 1, 0, -1):
+            out = chosen(RELATIONS["=="](index, k), entries[k - 1], out, self.quiet)
+        return out
+
+    def _unary(self, e: Unary, names: Names) -> Value:
+        value = self.evaluate(e.operand, names)
+        return entrywise(negated if e.operator == "not" else lambda x: -x, value)
+
+    def _binary(self, e: Binary, names: Names) -> Value:
+        sign = e.operator
+        if sign in ("and", "or"):
+            a = self.evaluate(e.left, names)
+            if isinstance(a, bool) and a == (sign == "or"):
+                return a
+            return entrywise(both if sign == "and" else either, a, self.evaluate(e.right, names))
+        a, b = self.evaluate(e.left, names), self.evaluate(e.right, names)
+        if sign in RELATIONS:
+            return RELATIONS[sign](a, b) if sign in ("==", "<>") else RELATIONS[sign](*map(self._compared, (a, b)))
+        if sign == "*" and isinstance(a, list) and isinstance(b, list):
+            return matrix_product(a, b)
+        if sign == "+" and isinstance(a, str):
+            return a + str(b)
+        if sign in ("/", "./") and self.guards and isinstance(b, int | float) and b == 0:
+            return entrywise(lambda _: sympy.nan, a)  # a branch without a value, as of a ramp that takes no time
+        if isinstance(a, Record) or isinstance(b, Record):
+            return of_complex_numbers(sign, a, b)
+        return entrywise(ARITHMETIC[sign.removeprefix(".")], a, b)
+
+    def _compared(self, value: Value) -> Value:
+        """A side of a relation. A choice in it that moves gets a name: SymPy would spread the relation over all
+        branches, and compare these as sets."""
+        if not isinstance(value, sympy.Expr) or not value.has(sympy.Piecewise):
+            return value
+        stays = isinstance(value, sympy.Piecewise) and not moves(value)
+        return self.give_name(value) if value.atoms(VariableSymbol) and not stays else value
+
+    def _choice(self, e: Choice, names: Names) -> Value:
+        pairs = []
+        depth = len(self.guards)
+        for condition, value in e.branches:
+            holds = self.evaluate(condition, names)
+            if holds is False:
+                continue
+            if holds is True:
+                pairs.append((True, self.evaluate(value, names)))
+                break
+            self.guards.append(holds)
+            pairs.append((holds, self.evaluate(value, names)))
+            self.guards[-1] = negated(holds)
+        else:
+            pairs.append((True, self.evaluate(e.otherwise, names)))
+        del self.guards[depth:]
+        out = pairs[-1][1]
+        for condition, value in reversed(pairs[:-1]):
+            out = chosen(condition, value, out, self.quiet or condition in self.quieted)
+        return out
+
+    def _comprehension(self, e: Comprehension, names: Names) -> list:
+        (name, over), *rest = e.iterators
+        values = self._range_of(over, names)
+        inner = Comprehension(e.value, tuple(rest)) if rest else e.value
+        return [self.evaluate(inner, _with(names, name, v)) for v in values]
+
+    def _range_of(self, e: Expression | None, names: Names) -> list:
+        if e is None:
+            raise ModelError("a loop without a range")
+        values = self.evaluate(e, names)
+        return values if isinstance(values, list) else [values]
+
+    def _range(self, e: Range, names: Names) -> list:
+        first, step, last = (self.constant(x, names) for x in (e.first, e.step, e.last))
+        count = math.floor(round((last - first) / step, 6)) + 1  # rounding: 0.3 / 0.1 is below 3
+        return [first + k * step for k in range(max(count, 0))]
+
+    def _matrix(self, e: Matrix, names: Names) -> list:
+        rows = []
+        for row in e.rows:
+            entries = [self.evaluate(x, names) for x in row]
+            rows.append([x for entry in entries for x in (entry if isinstance(entry, list) else [entry])])
+        return rows
+
+    def _part(self, e: Part, names: Names) -> Value:
+        whole = self.evaluate(e.whole, names)
+        return _field(whole, e.field) if e.field is not None else self._entry(whole, e.subscripts, names)
+
+    def constant(self, e: Expression, names: Names | None = None) -> Value:
+        """The value of an expression that must be known now, such as a subscript or the end of a loop."""
+        value = self.evaluate(e, names)
+        if not isinstance(value, int | float | bool | str | list):
+            raise ModelError(f"a constant is needed; got {value}")
+        return value
+
+    # --- calls -------------------------------------------------------------------------------------------------------
+
+    def _call(self, e: Call, names: Names) -> Value:
+        name = e.function
+        if name in self.special:
+            return self.special[name](*e.arguments)
+        if name in ("noEvent", "smooth"):
+            return self._without_events(e, names)
+        if name == "der":
+            return entrywise(der, self.evaluate(e.arguments[0], names))
+        arguments = [self.evaluate(a, names) for a in e.arguments]
+        named = {k: self.evaluate(v, names) for k, v in e.named}
+        if name in FUNCTIONS:
+            return FUNCTIONS[name](*arguments, **named)
+        return self.call(name, arguments, named)
+
+    def _without_events(self, e: Call, names: Names) -> Value:
+        if e.function == "smooth" and self.constant(e.arguments[0], names) == 0:
+            return self.evaluate(e.arguments[1], names)  # continuous only: its kinks stay events
+        before, self.quiet = self.quiet, True
+        try:
+            value = self.evaluate(e.arguments[-1], names)
+        finally:
+            self.quiet = before
+        if is_condition(value) and not isinstance(value, bool):
+            self.quieted.add(value)
+        return value
+
+    def call(self, name: str, arguments: list[Value], named: dict[str, Value]) -> Value:
+        """The results of a function that is not built in."""
+        raise NotImplementedError
+
+    def give_name(self, value: sympy.Expr) -> Value:
+        """A value by a name. Under conditions it is named as zero where they do not hold, for it need not have a
+        value there."""
+        if not self.guards:
+            return self.named(value)
+        condition = functools.reduce(both, self.guards)
+        if isinstance(condition, bool):  # what is never reached stays as it is
+            return value
+        guarded = chosen(condition, value, 0.0, quiet=True)
+        named = self.named(guarded)
+        return value if named is guarded else named
+
+
+def _field(value: Value, name: str) -> Value:
+    if isinstance(value, list):
+        return [_field(v, name) for v in value]
+    if not isinstance(value, dict) or name not in value:
+        raise ModelError(f"there is no field '{name}' in {value!r}")
+    return value[name]
+
+
+def index_of(k: Value, count: int) -> int:
+    if not (float(k).is_integer() and 1 <= k <= count):
+        raise ModelError(f"the subscript {k} is outside of 1:{count}")
+    return int(k) - 1
+
+
+def _with(names: Names, name: str, value: Value) -> Names:
+    return lambda n: value if n == name else names(n)
+
+
+def with_end(names: Names, count: int) -> Names:
+    return _with(names, "end", count)
+
+
+def local_names(local: Mapping[str, Value], outer: Names) -> Names:
+    def names(name: str) -> Value:
+        if name in local:
+            value = local[name]
+            if value is None:
+                raise ModelError(f"'{name}' is read before it is assigned")
+            return value
+        return outer(name)
+
+    return names
+
+
+def _refused(_: Evaluator, e: Any, __: Names) -> NoReturn:
+    raise ModelError(f"{type(e).__name__} cannot stand in an expression")
+
+
+_EVALUATED: dict[type, Callable[[Evaluator, Any, Names], Value]] = {
+    Number: lambda self, e, names: e.value,
+    Truth: lambda self, e, names: e.truth,
+    Text: lambda self, e, names: e.text,
+    End: lambda self, e, names: names("end"),
+    Reference: Evaluator._reference,
+    Call: Evaluator._call,
+    Unary: Evaluator._unary,
+    Binary: Evaluator._binary,
+    Choice: Evaluator._choice,
+    Array: lambda self, e, names: [x for a in e.entries for x in _entries(self, a, names)],
+    Matrix: Evaluator._matrix,
+    Range: Evaluator._range,
+    Comprehension: Evaluator._comprehension,
+    Part: Evaluator._part,
+    Several: lambda self, e, names: [None if x is None else self.evaluate(x, names) for x in e.entries],
+    Whole: _refused,
+}
+
+
+def _entries(self: Evaluator, e: Expression, names: Names) -> list[Value]:
+    """The entries that one argument of {…} stands for: several for `f(i) for i in …`."""
+    value = self.evaluate(e, names)
+    return value if isinstance(e, Comprehension) else [value]
