@@ -1,10 +1,12 @@
 """The examples of the Modelica Standard Library, read, compiled, run, compared and differentiated.
 
-    python -m benchmarks.modelica_library --texts FOLDER --references FOLDER [--only TEXT] [--out FILE] [--resume]
+    python -m benchmarks.modelica_library --texts FOLDER --references FOLDER [--library FOLDER] [--only TEXT]
+        [--out FILE] [--resume]
 
 `--texts` holds Base Modelica files `Modelica.*.bmo` (OpenModelica/BaseModelicaLibraryTesting.jl on GitHub, branch
 gh-pages, folders `results/main/Modelica/4.1.0/files/*`), in one folder or below it. `--references` is a checkout of
-modelica/MAP-LIB_ReferenceResults, branch v4.1.0. Neither is part of this project.
+modelica/MAP-LIB_ReferenceResults, branch v4.1.0. `--library` is a checkout of modelica/ModelicaStandardLibrary, tag
+v4.1.0: functions that a text calls but does not hold are read from it. None of them is part of this project.
 
 Each file runs in a process of its own, with limits of time and memory. A run agrees if each reference signal (those of
 `comparisonSignals.txt`, or all) is within 0.2 % of its range, where values may also be those within 0.2 % of the run's
@@ -22,6 +24,7 @@ import resource
 import sys
 import time
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +66,7 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.modelica_library")
     parser.add_argument("--texts", required=True)
     parser.add_argument("--references", required=True)
+    parser.add_argument("--library", help="sources of the functions that texts do not hold")
     parser.add_argument("--only", default="", help="files whose name contains this")
     parser.add_argument("--out", default="modelica_library.jsonl")
     parser.add_argument("--resume", action="store_true", help="leave out what is in --out already")
@@ -95,18 +99,19 @@ def _with_limits(there: Any, file: Path, asked: argparse.Namespace) -> None:
     used = int(time.process_time())
     resource.setrlimit(resource.RLIMIT_CPU, (used + asked.seconds, used + asked.seconds + 5))
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
-    for row in _rows(file, Path(asked.references), not asked.no_gradients):
+    roots = [asked.library] if asked.library else []
+    for row in _rows(file, Path(asked.references), not asked.no_gradients, roots):
         there.send(row)
 
 
-def _rows(file: Path, references: Path, gradients: bool):
+def _rows(file: Path, references: Path, gradients: bool, roots: Sequence[str] = ()):
     """The row of one file, in this process, after each stage and at the end."""
     sys.setrecursionlimit(20_000)
     warnings.simplefilter("ignore")
     row: dict = {"model": file.stem, "reached": "nothing", "seconds": 0.0}
     start = time.process_time()
     try:
-        for stage in _stages(file, references, gradients, row):
+        for stage in _stages(file, references, gradients, row, roots):
             row["reached"] = stage
             row[f"until_{stage}"] = row["seconds"] = round(time.process_time() - start, 2)
             yield row
@@ -118,10 +123,10 @@ def _rows(file: Path, references: Path, gradients: bool):
     yield row
 
 
-def _stages(file: Path, references: Path, gradients: bool, row: dict):
+def _stages(file: Path, references: Path, gradients: bool, row: dict, roots: Sequence[str]):
     """Reads, translates, compiles, runs, compares and differentiates; yields the name of each stage after it."""
     jax.config.update("jax_enable_x64", True)
-    flat = load(file)
+    flat = load(file, roots=roots)
     yield "read"
     names, data = _reference(file.stem, references)
     changing = {d.name for d in flat.model.declarations if not d.prefixes & {"parameter", "constant"}}

@@ -172,7 +172,7 @@ class Evaluator:
         if sign == "+" and isinstance(a, str):
             return a + str(b)
         if sign in ("/", "./") and self.guards and isinstance(b, int | float) and b == 0:
-            return entrywise(lambda _: sympy.nan, a)  # a branch without a value, as of a ramp that takes no time
+            b = self.named(sympy.Float(0))  # in a branch that is never taken, as a ramp that takes no time
         if isinstance(a, Record) or isinstance(b, Record):
             return of_complex_numbers(sign, a, b)
         return entrywise(ARITHMETIC[sign.removeprefix(".")], a, b)

@@ -49,7 +49,9 @@ class Interpreter(Evaluator):
             if name.startswith("Modelica.Math.") and last in FUNCTIONS:
                 return FUNCTIONS[last](*arguments, **named)
         if function is None:
-            raise ModelError(f"the function '{name}' is not known: {nearest(name, [*FUNCTIONS, *self.classes])}")
+            more = "; load(…, roots=[…]) reads it from the sources of its library" if "." in name else ""
+            near = nearest(name, [*FUNCTIONS, *self.classes])
+            raise ModelError(f"the function '{name}' is not known: {near}{more}")
         inputs = [d for d in function.declarations if "input" in d.prefixes]
         if function.kind == "record":
             inputs = list(function.declarations)

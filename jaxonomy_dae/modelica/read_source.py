@@ -195,21 +195,21 @@ class _SourceReader(Reader):
         if self.take("="):
             out.imports.append((name, self._path()))
         else:
-            while self.take("."):
-                if self.take("{"):
-                    while not self.take("}"):
-                        each = self.name()
-                        out.imports.append((each, f"{name}.{each}"))
-                        self.take(",")
-                    break
-                if self.take("*"):
-                    out.imports.append(("*", name))
-                    break
-                name += "." + self.name()
-            else:
-                out.imports.append((name.rpartition(".")[2], name))
+            self._import_by_name(out, name)
         self.comment()
         self.need(";")
+
+    def _import_by_name(self, out: Source, name: str) -> None:
+        while self.take("."):
+            if self.take("{"):
+                while not self.take("}"):
+                    each = self.name()
+                    out.imports.append((each, f"{name}.{each}"))
+                    self.take(",")
+                return
+            name += "." + self.name()
+        local = "*" if self.take(".*") else name.rpartition(".")[2]
+        out.imports.append((local, name))
 
     def _components(self) -> list[Declaration]:
         """The declarations of one clause, such as `Real a, b = 1;`."""
