@@ -29,8 +29,8 @@ from ..errors import ModelError
 from ..programs.cache import compiled
 from .devices import each, each_with_slopes
 from .factors import Factors
-from .objective import Misfit, Objective
-from .program import Layout, Setting, Weighted
+from .objective import Objective
+from .program import AbstractPredictor, Layout, Runs, Setting, Weighted, misfit
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -71,8 +71,7 @@ class Program(NamedTuple):
     """The static and dynamic parts from which the density's program is built."""
 
     setting: Setting
-    function: Any
-    structure: Any
+    predictor: AbstractPredictor
     backwards: bool
 
 
@@ -115,7 +114,7 @@ def density(program: Program, posed: Posed, u: Float[Array, " u"]) -> Float[Arra
     layout = program.setting.layout
 
     def one(shared, own, c):
-        return program.function(program.setting, program.structure, shared, own, c)
+        return misfit(program.setting, program.predictor, shared, own, c)
 
     def all_squares(shared, own):
         return each(one, layout.mesh, shared, own, posed.told)
@@ -173,7 +172,6 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     objective, minimum = estimate.objective, estimate.minimum
     s, c, free = objective.stacked, objective.coordinates, objective.free
     s.check_plain("the sampler")
-    misfit: Misfit = objective.misfit
     names, dtype = objective.evidence.labels, objective.system.parameters.values.dtype
     low, high = objective.bounds
     z, weights = minimum.z, minimum.weights
@@ -203,11 +201,13 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     bends, bend = priors.jacobian[bent], priors.residual[bent] - priors.jacobian[bent] @ z
     levels = Levels(jnp.asarray(sampled), jnp.asarray(place), array(np.where(sampled, counts, 0.0)))
     told = Posed(
-        misfit.told, levels, array(c.natural(estimate.point)), jnp.asarray(np.flatnonzero(free)),
+        objective.weighted, levels, array(c.natural(estimate.point)), jnp.asarray(np.flatnonzero(free)),
         jnp.asarray(c.log[free]), array(c.size[free]), array(low), array(high), array(weights.precision),
         array(weights.mean), array(bends), array(bend), array(centre), array(root),
     )  # fmt: skip
-    program = Program(objective.setting, misfit.function, misfit.structure, misfit.backwards)
+    backwards = objective.has_many and isinstance(objective.predictor, Runs)  # filters are differentiated forwards
+    predictor = Runs(None) if backwards else objective.predictor
+    program = Program(objective.setting, predictor, backwards)
     return program, told, names
 
 

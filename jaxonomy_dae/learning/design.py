@@ -22,6 +22,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 from ..errors import InitializationError, ModelError, SimulationError, nearest, whole_number
@@ -29,12 +30,11 @@ from .coordinates import Coordinates
 from .data import Stacked
 from .estimate import Estimate
 from .experiment import Planned
-from .filter_objective import AheadObjective
-from .filter_program import predict_ahead
+from .filter_program import Ahead
 from .identifiability import natural_scale
 from .objective import Objective
 from .problem import Problem
-from .program import Layout, predict_and_differentiate
+from .program import Layout, Owns, Shared, predict_and_differentiate
 from .runs import run
 
 DRAWS = 64  # records of innovations at most, for the information of a filter: exact up to 63 samples
@@ -235,44 +235,44 @@ def informations(known: Known, plans: list[Planned]) -> tuple[tuple[str, ...], F
     return stacked.labels, out
 
 
-def _told(planned: Objective, shared: Any, own: Any) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], ...]]:
+def _told(planned: Objective, shared: Shared, own: Owns) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], ...]]:
     """Pairs of derivatives by shared and own numbers, of shapes (c, n, k, s) and (c, n, k, o), whose squares the
     information is the sum of: those of predictions, in units of the noise, and of a filter those of the logarithms of
     the variances as well (`likelihood`). What a filter predicts depends on its samples: of these, some records of
     innovations ±1 are drawn, orthogonal to each other as columns of a Hadamard matrix are, so that their mean is the
     expectation where predictions are linear in the samples."""
-    s = planned.stacked
-    if not isinstance(planned, AheadObjective):
-        outputs, *slopes = predict_and_differentiate(planned.setting, shared, own, planned.conditions)
-        yield (_scaled(np.asarray(outputs), slopes, s.sigma),)
-        return
-    structure = dataclasses.replace(planned.structure, is_drawn=True)
-    count = min(2 ** int(np.ceil(np.log2(s.values[0].size + 1))), DRAWS)
-    signs = scipy.linalg.hadamard(count)[:, 1 + np.arange(s.values[0].size) % (count - 1)]
-    for row in signs:
-        values = jnp.asarray(np.broadcast_to(row.reshape(s.values[0].shape), s.values.shape), planned.told.values.dtype)
-        told = dataclasses.replace(planned.told, values=values)
-        pairs = predict_ahead(planned.setting, structure, shared, own, told)
-        (mean, variance), *slopes = pairs
-        first, second = ([part[j] for part in slopes] for j in (0, 1))
-        if not structure.is_filter:
-            yield (_scaled(np.asarray(mean), first, s.sigma),)
+    s, predictor, records = planned.stacked, planned.predictor, [planned.told]
+    if isinstance(predictor, Ahead):
+        predictor = Ahead(dataclasses.replace(predictor.structure, is_drawn=True))
+        count = min(2 ** int(np.ceil(np.log2(s.values[0].size + 1))), DRAWS)
+        signs = scipy.linalg.hadamard(count)[:, 1 + np.arange(s.values[0].size) % (count - 1)]
+        drawn = (np.broadcast_to(row.reshape(s.values[0].shape), s.values.shape) for row in signs)
+        dtype = planned.told.values.dtype
+        records = (dataclasses.replace(planned.told, values=jnp.asarray(values, dtype)) for values in drawn)
+    for told in records:
+        mean, *slopes = predict_and_differentiate(planned.setting, predictor, shared, own, told)
+        if mean.variance is None:
+            yield (_scaled(mean.values, [by.values for by in slopes], s.sigma),)
             continue
-        variance = np.asarray(variance, np.float64)
+        variance = np.asarray(mean.variance, np.float64)
         with np.errstate(invalid="ignore"):
             level = np.sqrt(variance)
-        yield _scaled(np.asarray(mean), first, level), _scaled(variance, second, np.sqrt(2) * variance)
+        by_variance = [by.variance for by in slopes if by.variance is not None]
+        yield (
+            _scaled(mean.values, [by.values for by in slopes], level),
+            _scaled(variance, by_variance, np.sqrt(2) * variance),
+        )
 
 
-def _scaled(values: np.ndarray, slopes: Any, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _scaled(values: ArrayLike, slopes: Sequence[ArrayLike], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives by shared and own numbers in units of shape (c, n, k); not-a-number where a run fails."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        factor = np.where(np.isfinite(values), 1.0, np.nan) / unit
+        factor = np.where(np.isfinite(np.asarray(values)), 1.0, np.nan) / unit
     by_shared, by_own = (np.asarray(a, np.float64) * factor[..., None] for a in slopes)
     return by_shared, by_own
 
 
-def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Any, Any]:
+def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Shared, Owns]:
     """Layout, data, and the numbers that the program is told."""
     problem, o = known.problem, known.objective
     layout, stacked = problem.laid_out([one.experiment(o.system.plan) for one in plans])
@@ -291,12 +291,9 @@ def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Any, A
 def _objective(known: Known, layout: Layout, stacked: Stacked) -> Objective:
     """What planned experiments are looked at by: runs, or the method of the estimate at hand."""
     o, counted = known.objective, np.ones(len(stacked.labels), bool)
-    structure = known.problem.errors(stacked)[0]
     c = known.problem.coordinates_of(o.setting._replace(layout=layout), stacked)
-    given = o.system, o.observers, layout, o.fine, stacked, c, {}, counted
-    if not isinstance(o, AheadObjective):
-        return Objective(*given)
-    return type(o)(*given, structure)
+    predictor = known.problem.errors(stacked)[0]
+    return Objective(o.system, o.observers, layout, o.fine, stacked, c, {}, counted=counted, predictor=predictor)
 
 
 def _columns(known: Known, planned: Coordinates) -> np.ndarray:

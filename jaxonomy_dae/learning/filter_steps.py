@@ -12,14 +12,13 @@ exponential, fifteen times faster than runs. Where constraints make states redun
 their tangent space by the derivative of the projection.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
@@ -28,27 +27,17 @@ from ..system.inputs import read_inputs, value_at
 from ..system.nonlinear import Refinement
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
+from .filter_data import Told
 from .filtering import Structure
 from .linear_models import affine_flow, linear_flow
-from .program import Layout, Setting, outputs_of, placed, run_end, with_kinds
+from .program import Layout, Own, SensorLaw, Setting, Shared, outputs_of, placed, run_end, with_kinds
+
+Instant: TypeAlias = Float[Array, ""]
+State: TypeAlias = Float[Array, " x"]  # of which the first f entries are differential
+Matrix: TypeAlias = Float[Array, "f f"]
+Discrete: TypeAlias = Float[Array, " q"] | None
 
 ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, which converge quadratically
-
-
-class Told(eqx.Module):
-    """The data for programs of e experiments at n times: samples and which there are, noise levels (NaN where they are
-    coordinates), known starts, and the standard deviations of their priors; and of each input, the w samples around the
-    time between each row and the one before: integration looks at all that it is given."""
-
-    times: Float[Array, "e n"]
-    t0: Float[Array, " e"]
-    known: Float[Array, "e known"]
-    inputs: dict[str, tuple[Float[Array, "e n w"], Float[Array, "e n w"]]]
-    values: Float[Array, "e n k"]
-    observed: Bool[Array, "e n k"]
-    sigma: Float[Array, "e k"]
-    spread: Float[Array, "e known"]
-    ends: Float[Array, "e n m"]  # of the m − 1 parts of the time before each row in which no input has a kink or jump
 
 
 class Model(NamedTuple):
@@ -57,17 +46,18 @@ class Model(NamedTuple):
     K, shape (f, k); and the options of `simulate`."""
 
     here: AcausalSystem
-    laws: dict[str, Any]
-    initial: dict[str, Any]
-    inputs: dict[str, Any]
+    laws: dict[str, SensorLaw]
+    initial: dict[str, Array]
+    inputs: dict[str, tuple[Array, Array, str]]
     diffusion: Float[Array, "f f"]
-    driven: dict[str, Any]
+    driven: dict[str, Float[Array, ""]]
     sigma: Float[Array, " k"]
     gain: Float[Array, "f k"]
     options: dict[str, Any]
 
 
-def model_of(setting: Setting, structure: Structure, shared: Any, own: Any, told: Told) -> Model:
+def model_of(setting: Setting, structure: Structure, shared: Shared, own: Own, told: Told) -> Model:
+    """The model of an experiment, with the numbers that a program is given; its inputs follow with each sample."""
     system, _, layout, _ = setting
     here, laws, initial = placed(setting, shared, own, told.known)
     end = len(shared) - len(layout.shared)
@@ -85,10 +75,13 @@ def model_of(setting: Setting, structure: Structure, shared: Any, own: Any, told
     gain = jnp.zeros((f, k), shared.dtype)
     for place, j, factor in structure.gain:
         gain = gain.at[place, j].set(next(extra) / factor)
-    return Model(here, laws, initial, {}, jnp.diag(diffusion), driven, sigma, gain, setting.options)
+    return Model(
+        here, laws, initial, inputs={}, diffusion=jnp.diag(diffusion), driven=driven, sigma=sigma, gain=gain,
+        options=setting.options,
+    )  # fmt: skip
 
 
-def start_of(setting: Setting, structure: Structure, shared: Any, own: Any, told: Told) -> tuple[Any, Any]:
+def start_of(setting: Setting, structure: Structure, shared: Shared, own: Own, told: Told) -> tuple[State, Matrix]:
     """The state at the start and the covariance that the priors of known starts give it."""
     system, _, layout, _ = setting
     f = len(system.plan.states)
@@ -106,7 +99,7 @@ def start_of(setting: Setting, structure: Structure, shared: Any, own: Any, told
     return found, root @ root.T
 
 
-def _run(m: Model, t0: Any, t1: Any, x: Any) -> tuple[Any, Any]:
+def _run(m: Model, t0: Instant, t1: Instant, x: State) -> tuple[State, Discrete]:
     """(state, discrete values) at t1 of a run from a state at t0; padded times repeat."""
     t1 = run_end(t0, t1)
     solution = simulate(
@@ -116,24 +109,24 @@ def _run(m: Model, t0: Any, t1: Any, x: Any) -> tuple[Any, Any]:
     return solution.states[-1], None if solution.discrete is None else solution.discrete[-1]
 
 
-def _held(m: Model, discrete: Any) -> AcausalSystem:
+def _held(m: Model, discrete: Discrete) -> AcausalSystem:
     return m.here if discrete is None else m.here.holding(discrete)
 
 
-def _jacobian(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
+def _jacobian(m: Model, t: Instant, x: State) -> Matrix:
     """∂f/∂x of the differential states, algebraic unknowns following them."""
     f, here = len(m.here.plan.states), m.here.at(t, m.inputs)
     return jax.jacfwd(lambda first: _slopes(here, jnp.concatenate([first, x[f:]])))(x[:f])
 
 
-def _slopes(here: SystemAt, x: Any) -> Float[Array, " f"]:
+def _slopes(here: SystemAt, x: State) -> Float[Array, " f"]:
     """The slopes of the differential states, algebraic unknowns following them."""
     if len(here.plan.carried):
         x = here.refined(x, Refinement.ROOT)
     return here.semi_explicit(x)[: len(here.plan.states)]
 
 
-def _intensity(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
+def _intensity(m: Model, t: Instant, x: State) -> Matrix:
     """σσᵀ at a state, that of noise of inputs included; kept in the tangent space of the constraints."""
     plan = m.here.plan
     tangent = _tangent(m, t, x, None)
@@ -152,7 +145,7 @@ def _intensity(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
     return g + b @ b.T
 
 
-def _tangent(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"] | None:
+def _tangent(m: Model, t: Instant, x: State, discrete: Discrete) -> Matrix | None:
     """The derivative of the projection onto hidden constraints; None if there are none."""
     plan = m.here.plan
     f = len(plan.states)
@@ -162,7 +155,9 @@ def _tangent(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"] | N
     return jax.jacfwd(lambda first: here.project(t, jnp.concatenate([first, x[f:]]), m.inputs)[:f])(x[:f])
 
 
-def read(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> tuple[Float[Array, " k"], Float[Array, "k f"]]:
+def read(
+    m: Model, layout: Layout, t: Instant, x: State, discrete: Discrete
+) -> tuple[Float[Array, " k"], Float[Array, "k f"]]:
     """Outputs at a state, and their derivatives by its differential entries."""
     f, here = len(m.here.plan.states), _held(m, discrete)
 
@@ -176,7 +171,7 @@ def read(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> tuple[Float
     return found, slopes
 
 
-def _forward(m: Model, substeps: int, t0: Any, t1: Any, x: Any, p: Any) -> tuple[Any, Any, Any]:
+def _forward(m: Model, substeps: int, t0: Instant, t1: Instant, x: State, p: Matrix) -> tuple[State, Matrix, Matrix]:
     """State, covariance and Φ at t1, from those at t0."""
     f = len(m.here.plan.states)
 
@@ -205,7 +200,7 @@ def _forward(m: Model, substeps: int, t0: Any, t1: Any, x: Any, p: Any) -> tuple
     return jax.lax.scan(part, first, (ends[:-1], ends[1:]))[0]
 
 
-def _forward_linear(m: Model, ends: Float[Array, " m"], x: Any, p: Any) -> tuple[Any, Any, Any]:
+def _forward_linear(m: Model, ends: Float[Array, " m"], x: State, p: Matrix) -> tuple[State, Matrix, Matrix]:
     """As `_forward`, for a linear model, part by part; in each part, inputs are linear in time."""
     f = len(x)
 
@@ -228,7 +223,7 @@ def _forward_linear(m: Model, ends: Float[Array, " m"], x: Any, p: Any) -> tuple
     return jax.lax.scan(part, first, pairs)[0]
 
 
-def read_values(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> Float[Array, " k"]:
+def read_values(m: Model, layout: Layout, t: Instant, x: State, discrete: Discrete) -> Float[Array, " k"]:
     """Outputs at a state."""
     inputs = read_inputs(m.here.plan, x.dtype, m.inputs)
     values = None if discrete is None else discrete[None]
@@ -237,8 +232,8 @@ def read_values(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> Floa
 
 
 def onwards(
-    m: Model, layout: Layout, structure: Structure, ends: Float[Array, " m"], x: Any, p: Any
-) -> tuple[Any, Any, Any, Any]:
+    m: Model, layout: Layout, structure: Structure, ends: Float[Array, " m"], x: State, p: Matrix
+) -> tuple[State, Matrix, Matrix, Discrete]:
     """(state, covariance, Φ, discrete values) after the parts of a step, from those before it: by matrix exponentials
     of a linear model, by the flow and its derivative, or by the flow alone, where no covariance is carried on."""
     if structure.is_linear:
@@ -249,9 +244,12 @@ def onwards(
     return x, p, jnp.zeros_like(p), discrete
 
 
-def corrected_by(x: Any, p: Any, row: tuple[Any, ...], is_drawn: bool = False) -> tuple[Any, Any, Any]:
-    """(state less the prediction, covariance, variances) after the outputs of one time, taken one by one (Joseph's
-    form, in which rounding leaves the covariance positive). Samples that are drawn are told as `Structure` says."""
+def corrected_by(
+    x: State, p: Matrix, row: tuple[Array, ...], is_drawn: bool = False
+) -> tuple[Float[Array, " f"], Matrix, tuple[Float[Array, " k"], Float[Array, " k"]]]:
+    """(state less the prediction, covariance, (variances, predictions)) after the outputs of one time, taken one by one
+    (Joseph's form, in which rounding leaves the covariance positive). Samples that are drawn are told as `Structure`
+    says."""
     eye = jnp.eye(len(p), dtype=p.dtype)
 
     def one(carry, given):
@@ -270,7 +268,9 @@ def corrected_by(x: Any, p: Any, row: tuple[Any, ...], is_drawn: bool = False) -
     return d, p, (variance, predicted)
 
 
-def moved_by(m: Model, t: Any, x: Any, d: Any, p: Any, discrete: Any) -> tuple[Any, Any]:
+def moved_by(
+    m: Model, t: Instant, x: State, d: Float[Array, " f"], p: Matrix, discrete: Discrete
+) -> tuple[State, Matrix]:
     """The state moved by a correction of its differential entries, onto the constraints, and the covariance there."""
     f = len(d)
     x = jnp.concatenate([x[:f] + d, x[f:]])

@@ -46,7 +46,7 @@ class Batches:
         full = o.full(z)
         shared, own = o.numbers(o.coordinates.natural(full))
         experiment, index, output = o.rows
-        counted, place, conditions, samples = weights, experiment, o.conditions, weights.samples
+        counted, place, conditions, samples = weights, experiment, o.told, weights.samples
         if chosen is not None:
             samples *= len(chosen) / len(self.counted)
             inside = np.isin(experiment, chosen)
@@ -55,8 +55,8 @@ class Batches:
             place = np.searchsorted(chosen, experiment)
             own = own[chosen]
             conditions = jax.tree.map(lambda a: a[chosen], conditions)
-        found = predict_and_differentiate(o.setting, shared, own, conditions)
-        outputs, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
+        found = predict_and_differentiate(o.setting, o.predictor, shared, own, conditions)
+        outputs, by_shared, by_own = (np.asarray(part.values, np.float64) for part in found)
         at = place, index, output
         residual, row = counted.bent(outputs[at] - o.stacked.values[experiment, index, output])
         c = o.coordinates

@@ -7,26 +7,41 @@ columns left out, so another set of frozen ones is the same program.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Iterable
+from typing import TypeVar
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from ..aliases import PyTree
 from ..system.system import AcausalSystem
 from .blocks import Block, block_of
 from .coordinates import Coordinates
 from .data import Stacked
-from .descent import Minimum, descend
+from .descent import AbstractMerit, Minimum, descend
 from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
 from .least_squares import SumOfSquares
+from .likelihood import Likelihood, Scoring
 from .noise import Tails
-from .program import Conditions, Layout, Setting, Weighted, misfit, predict, predict_and_differentiate
+from .program import (
+    AbstractPredictor,
+    Conditions,
+    Layout,
+    Outputs,
+    Owns,
+    Runs,
+    SensorLaw,
+    Setting,
+    Shared,
+    Weighted,
+    predict,
+    predict_and_differentiate,
+)
 from .smoothness import Bends, Law, spread_out
 
 
@@ -60,41 +75,31 @@ Same = TypeVar("Same", bound="Objective")
 Weigh = Callable[[np.ndarray, Evaluation], Weights]
 
 
-class Misfit(NamedTuple):
-    """A function of (setting, structure, shared numbers, own numbers, what is told of one
-    experiment), of shape (outputs,), its structure, what it is told of all, and whether its gradient is found
-    backwards."""
-
-    function: Callable[..., Any]
-    structure: Any
-    told: Weighted
-    backwards: bool = False
-
-
 @dataclasses.dataclass(frozen=True)
 class Objective:
     """The function that a fit minimises: a system with what stands around it, data, coordinates, and which experiments
     count. `fine` is the factor by which the tolerances of the problem are tightened."""
 
     system: AcausalSystem
-    observers: dict[str, Any]
+    observers: dict[str, SensorLaw]
     layout: Layout
     fine: float
     stacked: Stacked
     coordinates: Coordinates
-    penalties: dict[str, Any]  # "evidence" or a precision, by the name of a group
+    penalties: dict[str, float | str | None]  # "evidence" or a precision, by the name of a group
     counted: Bool[np.ndarray, " e"]
     # Over a part of the time, the centre of the priors of weights, free coordinates; None: zero, over all of it.
     near: Float[np.ndarray, " f"] | None = dataclasses.field(default=None, kw_only=True)
     # What is told of each step: its number, the cost, χ² for each sample, and what remains.
-    watch: Callable[[int, float, float, float], Any] | None = dataclasses.field(default=None, kw_only=True)
+    watch: Callable[[int, float, float, float], None] | None = dataclasses.field(default=None, kw_only=True)
     # Networks with a prior of smoothness, and where they have it.
     laws: tuple[Law, ...] = dataclasses.field(default=(), kw_only=True)
+    predictor: AbstractPredictor = dataclasses.field(default=Runs(), kw_only=True)
 
     @property
     def has_variances(self) -> bool:
         """True if the model itself says how large residuals are."""
-        return False
+        return self.predictor.has_variances
 
     @property
     def setting(self) -> Setting:
@@ -150,7 +155,7 @@ class Objective:
         """The conditions of all experiments, for the programs, as arrays of the system's dtype."""
         s, dtype = self.stacked, self.system.parameters.values.dtype
 
-        def number(value: Any) -> float:
+        def number(value: float | Unknown) -> float:
             return float(value.guess if isinstance(value, Unknown) else value)
 
         known = [[number(s.starts[name][k]) for name in self.layout.known] for k in range(len(s.labels))]
@@ -169,20 +174,24 @@ class Objective:
         lengths = self.layout.lengths
         return jnp.asarray([lengths.index(count) for count in self.stacked.counts]) if lengths else None
 
-    @property
-    def misfit(self) -> Misfit:
-        """Squared residuals as a program sums them, and what it is told."""
-        backwards = self.coordinates.n_shared + self.coordinates.n_own > MANY
-        adjoint = None if backwards else diffrax.ForwardMode()
-        return Misfit(misfit, adjoint, self.weighted(self.conditions), backwards)
+    @functools.cached_property
+    def told(self) -> PyTree:
+        """What programs are told of all experiments."""
+        return self.predictor.told(self.system, self.layout, self.stacked, self.conditions)
 
-    def weighted(self, told: Any) -> Weighted:
-        """The conditions `told` with samples and their weights, for the programs."""
+    @property
+    def has_many(self) -> bool:
+        """True if the gradient of a scalar costs less backwards."""
+        return self.coordinates.n_shared + self.coordinates.n_own > MANY
+
+    @property
+    def weighted(self) -> Weighted:
+        """What programs are told, with samples and their weights."""
         s, dtype = self.stacked, self.system.parameters.values.dtype
-        level = np.where(np.isnan(s.sigma), s.unit, s.sigma)
+        level = np.ones(s.values.shape) if self.has_variances else np.where(np.isnan(s.sigma), s.unit, s.sigma)
         row = np.zeros(s.values.shape)
         row[self.rows] = (np.sqrt(s.weight)[:, None, None] / level)[self.rows]
-        return Weighted(told, jnp.asarray(s.values, dtype), jnp.asarray(row, dtype))
+        return Weighted(self.told, jnp.asarray(s.values, dtype), jnp.asarray(row, dtype))
 
     def full(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " p"]:
         """All coordinates, those that are not searched at their starts."""
@@ -190,38 +199,64 @@ class Objective:
         out[self.free] = z
         return out
 
-    def numbers(self, natural: Float[np.ndarray, " p"]) -> tuple[Any, Any]:
+    def numbers(self, natural: Float[np.ndarray, " p"]) -> tuple[Shared, Owns]:
         """(shared, own) natural values as the program takes them."""
         dtype = self.system.parameters.values.dtype
         shared, own = self.coordinates.split(natural)
         return jnp.asarray(shared, dtype), jnp.asarray(own, dtype)
 
-    def predicted(self, z: Float[np.ndarray, " p"], of: Bool[np.ndarray, " e"] | None = None) -> Predicted:
-        """Everything at a point, by the program; NaN for the outputs of other experiments than those asked for."""
-        shared, own = self.numbers(self.coordinates.natural(z))
-        if of is None or of.all():
-            found = predict_and_differentiate(self.setting, shared, own, self.conditions)
-            return Predicted(*(np.asarray(a, np.float64) for a in found))
-        some = jax.tree.map(lambda a: a[of], self.conditions)
-        found = predict_and_differentiate(self.setting, shared, own[of], some)
-        wide = [np.full((len(of), *a.shape[1:]), fill) for a, fill in zip(found, (np.nan, 0.0, 0.0), strict=True)]
-        for all_of, few in zip(wide, found, strict=True):
-            all_of[of] = few
-        return Predicted(*wide)
+    def predicted(self, z: Float[np.ndarray, " p"]) -> Predicted:
+        """All outputs at a point with their derivatives, by the program."""
+        return self._differentiated(z, np.ones(len(self.counted), bool))[0]
+
+    def _differentiated(
+        self, z: Float[np.ndarray, " p"], of: Bool[np.ndarray, " e"]
+    ) -> tuple[Predicted, Predicted | None]:
+        """(outputs, their variances if the predictor says them) at a point, with derivatives; NaN for the outputs of
+        experiments that are not asked for."""
+        (shared, own), told = self.numbers(self.coordinates.natural(z)), self.told
+        if self.has_variances:  # the same program tells the variances of experiments that are held out
+            of = np.ones(len(of), bool)
+        if not of.all():
+            own, told = own[of], jax.tree.map(lambda a: a[of], told)
+        found = predict_and_differentiate(self.setting, self.predictor, shared, own, told)
+
+        def whole(parts: Iterable[ArrayLike]) -> Predicted:
+            arrays = [np.asarray(a, np.float64) for a in parts]
+            wide = [np.full((len(of), *a.shape[1:]), fill) for a, fill in zip(arrays, (np.nan, 0.0, 0.0), strict=True)]
+            for all_of, few in zip(wide, arrays, strict=True):
+                all_of[of] = few
+            return Predicted(*wide)
+
+        variances = [part.variance for part in found if part.variance is not None]
+        return whole(part.values for part in found), whole(variances) if variances else None
 
     def outputs(self, z: Float[np.ndarray, " p"]) -> Float[np.ndarray, "e n k"]:
         """The outputs of all experiments at a point, without derivatives."""
-        return self._runs(z)[..., : len(self.layout.outputs)]
+        if isinstance(self.predictor, Runs):
+            return self._runs(z)[..., : len(self.layout.outputs)]
+        return np.asarray(self.predictions(z).values, np.float64)
+
+    def predictions(self, z: Float[np.ndarray, " p"]) -> Outputs:
+        """All that the predictor finds of all experiments at a point."""
+        shared, own = self.numbers(self.coordinates.natural(z))
+        return predict(self.setting, self.predictor, shared, own, self.told)
 
     def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
-        """Residuals and Jacobian of the free coordinates; None where a run that counts fails."""
+        """Residuals and Jacobian of the free coordinates, with their variances if the predictor says them; None where a
+        run that counts fails."""
         full = self.full(z)
-        found = self.predicted(full, self.counted)
-        residual = found.outputs[self.rows] - self.stacked.values[self.rows]
-        jacobian = (found.jacobian(self.rows) * self.coordinates.slope(full))[:, self.free]
-        if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
-            return None
-        return Evaluation(residual, jacobian)
+        found, variance = self._differentiated(full, self.counted)
+        slope = self.coordinates.slope(full)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            parts = [
+                found.outputs[self.rows] - self.stacked.values[self.rows],
+                (found.jacobian(self.rows) * slope)[:, self.free],
+            ]
+            if variance is not None:
+                s = variance.outputs[self.rows]
+                parts += [np.where(s > 0, s, np.nan), (variance.jacobian(self.rows) / s[:, None] * slope)[:, self.free]]
+        return Evaluation(*parts) if all(np.isfinite(a).all() for a in parts) else None
 
     def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
         """Residuals alone; None where a run that counts fails."""
@@ -233,7 +268,7 @@ class Objective:
         shared, own = self.numbers(self.coordinates.natural(full))
         outputs = (*self.layout.outputs, *self._inputs)
         setting = self.setting._replace(layout=dataclasses.replace(self.layout, outputs=outputs))
-        return np.asarray(predict(setting, diffrax.ForwardMode(), shared, own, self.conditions), np.float64)
+        return np.asarray(predict(setting, Runs(), shared, own, self.conditions).values, np.float64)
 
     @functools.cached_property
     def blocks(self) -> dict[str, Block]:
@@ -283,22 +318,24 @@ class Objective:
         that the data choose, beginning with the priors of `first`."""
 
         def weigh(z: np.ndarray, found: Evaluation) -> Weights:
-            if weights is not None:
+            if weights is not None and not self.has_variances:
                 return weights
-            return self.weights(z, found) if first is None else self.weights(z, found).with_priors_of(first)
+            priors, here = weights or first, self.weights(z, found)
+            return here if priors is None else here.with_priors_of(priors)
 
         reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
         return descend(self._merit(weigh), start, self.limits, reweigh, steps, self.watch)
 
-    def _merit(self, weigh: Weigh) -> SumOfSquares:
-        columns = self.coordinates.n_shared + self.coordinates.n_own  # of the program, whatever is frozen
-        alone = self.residual if columns > FEW else None
-
-        def finer(factor: float) -> SumOfSquares | None:
+    def _merit(self, weigh: Weigh) -> AbstractMerit:
+        def finer(factor: float) -> AbstractMerit | None:
             other = self.finer(factor)
             return None if other is None else other._merit(weigh)
 
-        return SumOfSquares(self.evaluate, weigh, self.tolerance, finer, self.hidden, alone)
+        given = self.evaluate, weigh, self.tolerance, finer, self.hidden
+        if self.has_variances:
+            return Scoring(*given, limited=self.coordinates.log[self.free])
+        columns = self.coordinates.n_shared + self.coordinates.n_own  # of the program, whatever is frozen
+        return SumOfSquares(*given, residual=self.residual if columns > FEW else None)
 
     @property
     def hidden(self) -> Bool[np.ndarray, " f"]:
@@ -324,8 +361,10 @@ class Objective:
         return dataclasses.replace(self, fine=self.fine * tolerance / self.tolerance)
 
     def sigma(self, z: Float[np.ndarray, " f"], weights: Weights) -> dict[str, float]:
-        """Noise levels that were estimated, by name, at a minimum."""
-        return self.evidence.sigma(weights)
+        """Noise levels that were estimated, by name, at a minimum: by the evidence, or as coordinates."""
+        natural = dict(zip(self.coordinates.names, self.coordinates.natural(self.full(z)), strict=True))
+        names = (self.stacked.outputs[j] for j in self.predictor.levels)
+        return self.evidence.sigma(weights) | {name: float(natural[f"sigma of {name}"]) for name in names}
 
     def surprise(self, found: Minimum) -> float:
         """−ln (likelihood) at a minimum, less a constant, with the priors that were given: by it, minima of the same
@@ -340,9 +379,15 @@ class Objective:
         self, full: Float[np.ndarray, " p"], sigma: dict[str, float], rows: tuple[np.ndarray, ...]
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """(residuals of chosen samples in units of the noise, these units)."""
-        s = self.with_noise(sigma).stacked
-        level = np.where(np.isnan(s.sigma), s.unit, s.sigma)[rows]
-        return (self.outputs(full)[rows] - s.values[rows]) / level, level
+        s, variance = self.with_noise(sigma).stacked, None
+        if self.has_variances:
+            found, variance = self._differentiated(full, np.ones(len(self.counted), bool))
+            outputs = found.outputs
+        else:
+            outputs = self.outputs(full)
+        with np.errstate(invalid="ignore"):
+            level = np.where(np.isnan(s.sigma), s.unit, s.sigma) if variance is None else np.sqrt(variance.outputs)
+        return (outputs[rows] - s.values[rows]) / level[rows], level[rows]
 
     # --- experiments that are held out ---------------------------------------------------------------------------
 
@@ -390,9 +435,10 @@ class Objective:
 
     @functools.cached_property
     def evidence(self) -> Evidence:
-        """The noise levels and precisions that the evidence determines."""
+        """The noise levels and precisions that the evidence determines: of precisions alone, if the predictor says how
+        large residuals are."""
         s, (_, _, output) = self.stacked, self.rows
-        unknown = np.isnan(s.sigma[self.rows])
+        unknown = np.isnan(s.sigma[self.rows]) & (not self.has_variances)
         chosen = tuple(dict.fromkeys(s.level_of[j] for j in np.unique(output[unknown])))
         place = np.array([chosen.index(name) if name in chosen else -1 for name in s.level_of])
         noise, unit = np.where(unknown, place[output], -1), s.unit[self.rows]
@@ -417,7 +463,7 @@ class Objective:
         return () if self.near is not None else tuple(np.isin(places, law.columns) for law in self.laws)
 
     def weights(self, z: Float[np.ndarray, " f"], found: Evaluation) -> Weights:
-        """The first weights: noise levels that are known or as large as the residuals, and priors."""
+        """The first weights: priors, and noise levels that are known, as large as residuals, or by the variances."""
         s, c, experiment = self.stacked, self.coordinates, self.rows[0]
         sigma = s.sigma[self.rows]
         row = np.sqrt(s.weight[experiment]) / np.where(np.isnan(sigma), 1.0, sigma)
@@ -436,7 +482,10 @@ class Objective:
         first = Weights(row, precision, mean, np.sqrt(s.weight[experiment]), tails=self.tails)
         if self.bends is not None and self.near is None:
             first = dataclasses.replace(first, bends=self.bends, stiffness=self.bends.first(z))
-        return self.evidence.first(first, found)
+        if found.variance is None:
+            return self.evidence.first(first, found)
+        plain = Likelihood(first.share / np.sqrt(found.variance), first.precision, first.mean, first.share)
+        return plain.with_priors_of(first)
 
     @functools.cached_property
     def tails(self) -> Tails | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..diagnosis.wording import quoted
 from ..errors import ModelError, nearest, whole_number
@@ -17,7 +17,7 @@ from .band import Band, law_of, law_values
 from .chains import begin, blackjax, chain
 from .density import coordinates_at, posed
 from .prediction import Prediction, under
-from .program import Conditions, Setting, run_one
+from .program import Conditions, Owns, Runs, Setting
 from .table import Row, Table
 
 if TYPE_CHECKING:
@@ -168,11 +168,11 @@ class Posterior:
 
 
 @compiled
-def _runs(setting: Setting, shared: Any, own: Any, conditions: Conditions) -> Any:
+def _runs(setting: Setting, shared: Float[Array, "d s"], own: Owns, conditions: Conditions) -> Float[Array, "d n k"]:
     """The outputs of one experiment for several values, one after the other: as a batch, each would take as many steps
     as the longest."""
     c = jax.tree.map(lambda a: a[0], conditions)
-    return jax.lax.map(lambda at: run_one(setting, None, at[0], at[1], c), (shared, own))
+    return jax.lax.map(lambda at: Runs(None)(setting, at[0], at[1], c).values, (shared, own))
 
 
 def sample(estimate: "Estimate", draws: int, chains: int, warmup: int, seed: int) -> Posterior:

@@ -71,7 +71,9 @@ def under(
         raise ModelError(f"ts must be increasing times, of shape (n,), that start at {s.t0[k]:g} or later")
     layout = dataclasses.replace(objective.layout, outputs=tuple(names), mesh=None, lengths=())
     system, observers = objective.system, objective.observers
-    one = Objective(system, observers, layout, objective.fine, s, objective.coordinates, {}, objective.counted)
+    one = Objective(
+        system, observers, layout, objective.fine, s, objective.coordinates, {}, counted=objective.counted
+    )  # fmt: skip
     conditions = jax.tree.map(lambda a: a[k][None], one.conditions)
     conditions = dataclasses.replace(conditions, times=jnp.asarray(times[None], conditions.times.dtype))
     return one, k, names, conditions
@@ -85,8 +87,8 @@ def prediction(
     one, k, names, conditions = under(objective, names, ts, experiment)
     c, times = one.coordinates, np.asarray(conditions.times[0], np.float64)
     shared, own = one.numbers(c.natural(point))
-    found = predict_and_differentiate(one.setting, shared, own[k][None], conditions)
-    alone = Predicted(*(np.asarray(a, np.float64) for a in found))
+    found = predict_and_differentiate(one.setting, one.predictor, shared, own[k][None], conditions)
+    alone = Predicted(*(np.asarray(part.values, np.float64) for part in found))
     n, j = len(times), len(names)
     rows = tuple(a.ravel() for a in np.meshgrid([0], np.arange(n), np.arange(j), indexing="ij"))
     place = c.n_shared + k * c.n_own

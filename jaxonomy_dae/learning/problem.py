@@ -23,13 +23,13 @@ from .devices import check_mesh
 from .estimate import Estimate
 from .evaluation import Evaluation, Weights
 from .experiment import Experiment, Unknown
-from .filter_objective import AheadObjective, FilterObjective
-from .filtering import Filter, Innovations, Structure, structure_and_extras
+from .filter_program import Ahead
+from .filtering import Filter, Innovations, structure_and_extras
 from .identifiability import Identifiability, identifiability
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .priors import priors_by_name
-from .program import Layout, Setting
+from .program import AbstractPredictor, Layout, Runs, Setting
 from .progress import reporter
 from .runs import residuals, run, why_not
 from .smoother import smoother
@@ -153,11 +153,12 @@ class Problem:
     def _setting(self) -> Setting:
         return Setting(self.system, self.observers, self._layout, 1.0)
 
-    def errors(self, stacked: Stacked) -> tuple[Structure, tuple[Coordinate, ...]]:
-        """The static choices that the method adds to the program, and its coordinates."""
-        if isinstance(self.method, Filter | Innovations):
-            return structure_and_extras(self.method, self.system, stacked)
-        return Structure(), ()
+    def errors(self, stacked: Stacked) -> tuple[AbstractPredictor, tuple[Coordinate, ...]]:
+        """How the method predicts outputs, and the coordinates that come with it."""
+        if not isinstance(self.method, Filter | Innovations):
+            return Runs(), ()
+        structure, extras = structure_and_extras(self.method, self.system, stacked)
+        return Ahead(structure), extras
 
     def coordinates_of(self, setting: Setting, stacked: Stacked) -> Coordinates:
         """The coordinates for these data, with the problem's priors."""
@@ -201,12 +202,11 @@ class Problem:
         """The function that a fit minimises."""
         if self.method not in METHODS:
             stacked.check_plain(f"method={type(self.method).__name__}")
-        model = self.system, self.observers, self.layout_of(stacked), 1.0
-        given = stacked, c, self.penalties if penalties is None else penalties, ~stacked.holdout
-        if not isinstance(self.method, Filter | Innovations):
-            return Objective(*model, *given)
-        kind = FilterObjective if isinstance(self.method, Filter) else AheadObjective
-        return kind(*model, *given, self.errors(stacked)[0])
+        return Objective(
+            self.system, self.observers, self.layout_of(stacked), 1.0, stacked, c,
+            penalties=self.penalties if penalties is None else penalties, counted=~stacked.holdout,
+            predictor=self.errors(stacked)[0],
+        )  # fmt: skip
 
     # --- fitting -----------------------------------------------------------------------------------------------
 

@@ -1,31 +1,46 @@
-"""The compiled program behind a problem: predictions of all experiments, and their Jacobian.
+"""The compiled programs behind a problem: predictions of all experiments, and their derivatives.
 
-It is given natural values: those of trained parameters, of weights, of starts. Everything that may change from fit to
-fit (data, noise, inputs, times, starts, what is frozen, bounds, scales) is an argument of it, or is applied to what it
-returns. What it depends on is a `Layout`, in which names and shapes alone count.
+How the outputs of one experiment are predicted is a value, an `AbstractPredictor`: by runs from its start to its end
+(`Runs`), or from sample to sample (`filter_program.Ahead`). Each program below serves all of them.
+
+A program is given natural values: those of trained parameters, of weights, of starts. Everything that may change from
+fit to fit (data, noise, inputs, times, starts, what is frozen, bounds, scales) is an argument of it, or is applied to
+what it returns. What it depends on is a `Layout`, in which names and shapes alone count.
 
 The Jacobian is found forwards, one experiment at a time, so its cost is linear in the number of experiments whose
 starts are their own.
 """
 
+import abc
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, Int
 
+from ..aliases import PyTree
 from ..errors import ModelError
 from ..programs.cache import compiled
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..system.system import AcausalSystem
+from .data import Stacked
 from .devices import each, each_with_slopes
+
+Inputs: TypeAlias = dict[str, tuple[Float[Array, "*e _"], Float[Array, "*e _"]]]  # times and values of samples by name
+SensorLaw: TypeAlias = Callable[[Solution], Array]
+Shared: TypeAlias = Float[Array, " s"]  # numbers that all experiments share, in natural values
+Own: TypeAlias = Float[Array, " o"]  # those of one experiment
+Owns: TypeAlias = Float[Array, "e o"]  # those of all
+Module = TypeVar("Module", bound=PyTree)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +70,7 @@ class Setting(NamedTuple):
     tolerances, `fine`, below one where a search has to see more than the integration's error lets it."""
 
     system: AcausalSystem
-    observers: dict[str, Any]
+    observers: dict[str, SensorLaw]
     layout: Layout
     fine: float | Float[Array, ""]
 
@@ -72,25 +87,54 @@ class Conditions(eqx.Module):
     times: Float[Array, "e n"]
     t0: Float[Array, " e"]
     known: Float[Array, "e known"]
-    inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
+    inputs: Inputs
     length: Int[Array, " e"] | None = None  # the place of each one's number of times in `Layout.lengths`
+
+
+class Outputs(eqx.Module):
+    """Predictions of n samples of k outputs; and their variances, if the predictor says how far samples scatter."""
+
+    values: Float[Array, "*n k"]
+    variance: Float[Array, "*n k"] | None
+
+
+class AbstractPredictor(eqx.Module):
+    """A way to predict the outputs of one experiment, and a part of what a program is made for."""
+
+    @property
+    def has_variances(self) -> bool:
+        """True if it says how large the errors of its predictions are."""
+        return False
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """The outputs whose noise levels are coordinates."""
+        return ()
+
+    def told(self, system: AcausalSystem, layout: Layout, stacked: Stacked, conditions: Conditions) -> PyTree:
+        """What programs are told of all experiments; the first axis of each array counts these."""
+        return conditions
+
+    @abc.abstractmethod
+    def __call__(self, setting: Setting, shared: Shared, own: Own, told: PyTree) -> Outputs:
+        """The predictions for one experiment; NaN where a run fails."""
 
 
 class Weighted(eqx.Module):
     """The conditions of e experiments, `told`, with samples `values` and the square roots `row` of their weights: √w/σ,
     or √w where the noise level is estimated or follows from the model; zero where there is no sample."""
 
-    told: Any
+    told: PyTree
     values: Float[Array, "e n k"]
     row: Float[Array, "e n k"]
 
 
-def weights_of(module: Any) -> list[Any]:
+def weights_of(module: PyTree) -> list[Array]:
     """The arrays of a network or sensor law that are trained."""
     return jax.tree.leaves(eqx.filter(module, eqx.is_inexact_array))
 
 
-def with_weights(module: Any, numbers: Any) -> Any:
+def with_weights(module: Module, numbers: Float[Array, " count"]) -> Module:
     """A module whose trained arrays are read, one after the other, from an array of shape (count,)."""
     leaves, structure = jax.tree.flatten(eqx.filter(module, eqx.is_inexact_array))
     new, place = [], 0
@@ -101,7 +145,9 @@ def with_weights(module: Any, numbers: Any) -> Any:
     return eqx.combine(jax.tree.unflatten(structure, new), module)
 
 
-def with_values(setting: Setting, shared: Any) -> tuple[AcausalSystem, dict[str, Any], Any]:
+def with_values(
+    setting: Setting, shared: Shared
+) -> tuple[AcausalSystem, dict[str, SensorLaw], Float[Array, " starts"]]:
     """(system, sensor laws, shared starts) with the shared numbers in their places."""
     system, observers, layout, _ = setting
     n = len(layout.parameters)
@@ -119,7 +165,9 @@ def with_values(setting: Setting, shared: Any) -> tuple[AcausalSystem, dict[str,
     return system, observers, shared[n + len(layout.extra) :]
 
 
-def placed(setting: Setting, shared: Any, own: Any, known: Any) -> tuple[AcausalSystem, dict[str, Any], dict[str, Any]]:
+def placed(
+    setting: Setting, shared: Shared, own: Own, known: Float[Array, " known"]
+) -> tuple[AcausalSystem, dict[str, SensorLaw], dict[str, Array]]:
     """(system, sensor laws, starts by variables' names) of one experiment, with its own parameters in their places."""
     layout = setting.layout
     system, observers, starts = with_values(setting, shared)
@@ -133,43 +181,56 @@ def placed(setting: Setting, shared: Any, own: Any, known: Any) -> tuple[Acausal
     return system, observers, initial
 
 
-def run_one(setting: Setting, adjoint: Any, shared: Any, own: Any, c: Conditions) -> Float[Array, "n k"]:
-    """The outputs of one experiment."""
-    layout = setting.layout
-    system, observers, initial = placed(setting, shared, own, c.known)
-    solution = simulate(
-        system, run_end(c.t0, c.times[-1]), t0=c.t0, ts=c.times, initial=initial or None, adjoint=adjoint, throw=False,
-        inputs=with_kinds(c.inputs, layout), **setting.options,
-    )  # fmt: skip
-    return outputs_of(solution, observers, layout, c.times.dtype, c.length)
+class Runs(AbstractPredictor):
+    """Outputs of a run from the start of an experiment to its end, with derivatives by `adjoint` (as in `simulate`)."""
+
+    adjoint: PyTree = diffrax.ForwardMode()
+
+    def __call__(self, setting: Setting, shared: Shared, own: Own, told: Conditions) -> Outputs:
+        layout, c = setting.layout, told
+        system, observers, initial = placed(setting, shared, own, c.known)
+        solution = simulate(
+            system, run_end(c.t0, c.times[-1]), t0=c.t0, ts=c.times, initial=initial or None, adjoint=self.adjoint,
+            throw=False, inputs=with_kinds(c.inputs, layout), **setting.options,
+        )  # fmt: skip
+        return Outputs(outputs_of(solution, observers, layout, c.times.dtype, c.length), None)
 
 
-def misfit(setting: Setting, adjoint: Any, shared: Any, own: Any, c: Weighted) -> Float[Array, " k"]:
-    """The sum of squared weighted residuals of each output in a run of one experiment; NaN where it fails."""
-    outputs = run_one(setting, adjoint, shared, own, c.told)
-    return jnp.sum(jnp.where(c.row > 0, c.row * (outputs - c.values), 0.0) ** 2, axis=0)
+def misfit(setting: Setting, predictor: AbstractPredictor, shared: Shared, own: Own, c: Weighted) -> Float[Array, " k"]:
+    """For each output of one experiment, the sum of squared weighted residuals, or with variances s, Σ w (r²/s + ln s);
+    NaN where a run fails."""
+    found = predictor(setting, shared, own, c.told)
+    seen, residual = c.row > 0, found.values - c.values
+    if found.variance is None:
+        return jnp.sum(jnp.where(seen, c.row * residual, 0.0) ** 2, axis=0)
+    s = jnp.where(seen, found.variance, 1.0)
+    return jnp.sum(jnp.where(seen, c.row**2 * (residual**2 / s + jnp.log(s)), 0.0), axis=0)
 
 
-def with_kinds(inputs: dict[str, Any], layout: Layout) -> dict[str, Any]:
+def with_kinds(inputs: Inputs, layout: Layout) -> dict[str, tuple[Array, Array, str]]:
     """Samples of inputs as `simulate` takes them."""
     kinds = dict(layout.kinds)
     return {name: (*samples, kinds[name]) for name, samples in inputs.items()}
 
 
-def run_end(t0: Any, last: Any) -> Any:
+def run_end(t0: Float[Array, ""], last: Float[Array, ""]) -> Float[Array, ""]:
     """The end of a run to the last sample: runs of no length are made of next to none."""
     return jnp.where(last > t0, last, t0 + 8 * jnp.finfo(t0.dtype).eps * (1 + jnp.abs(t0)))
 
 
 def outputs_of(
-    solution: Solution, observers: dict[str, Any], layout: Layout, dtype: Any, length: Any = None
+    solution: Solution,
+    observers: dict[str, SensorLaw],
+    layout: Layout,
+    dtype: DTypeLike,
+    length: Int[Array, ""] | None = None,
 ) -> Float[Array, "n k"]:
     """The outputs of a run. Sensor laws see its record alone: none of the times by which it was padded."""
     variables = [name for name in layout.outputs if name not in observers]
     read = dict(zip(variables, solution[variables].T, strict=True)) if variables else {}
     chosen = [name for name in layout.outputs if name in observers]
 
-    def derived(rows: int) -> dict[str, Any]:
+    def derived(rows: int) -> dict[str, Array]:
         own = solution if rows == len(solution.ts) else _first_rows(solution, rows)
         found = {name: _checked(name, observers[name](own), rows, dtype) for name in chosen}
         return {name: jnp.pad(values, (0, len(solution.ts) - rows), mode="edge") for name, values in found.items()}
@@ -182,15 +243,11 @@ def outputs_of(
 
 
 def _first_rows(solution: Solution, rows: int) -> Solution:
-    def first(a: Any) -> Any:
-        return None if a is None else a[:rows]
-
-    return dataclasses.replace(
-        solution, ts=first(solution.ts), states=first(solution.states), discrete=first(solution.discrete)
-    )
+    discrete = None if solution.discrete is None else solution.discrete[:rows]
+    return dataclasses.replace(solution, ts=solution.ts[:rows], states=solution.states[:rows], discrete=discrete)
 
 
-def _checked(name: str, values: Any, rows: int, dtype: Any) -> Float[Array, " n"]:
+def _checked(name: str, values: ArrayLike, rows: int, dtype: DTypeLike) -> Float[Array, " n"]:
     """What a sensor law returned, if it is a real number for each time."""
     values = jnp.asarray(values)
     if values.shape != (rows,) or not jnp.issubdtype(values.dtype, jnp.floating):
@@ -202,22 +259,20 @@ def _checked(name: str, values: Any, rows: int, dtype: Any) -> Float[Array, " n"
 
 
 @compiled
-def predict(setting: Setting, adjoint: Any, shared: Any, own: Any, conditions: Conditions) -> Float[Array, "e n k"]:
-    """The outputs of all experiments; NaN where a run failed."""
-
-    def one(shared, own, c):
-        return run_one(setting, adjoint, shared, own, c)
-
-    return each(one, setting.layout.mesh, shared, own, conditions)
+def predict(setting: Setting, predictor: AbstractPredictor, shared: Shared, own: Owns, told: PyTree) -> Outputs:
+    """All that a predictor finds of all experiments; NaN where a run failed."""
+    return each(lambda s, o, c: predictor(setting, s, o, c), setting.layout.mesh, shared, own, told)
 
 
 @compiled
 def predict_and_differentiate(
-    setting: Setting, shared: Any, own: Any, conditions: Conditions
-) -> tuple[Float[Array, "e n k"], Float[Array, "e n k s"], Float[Array, "e n k o"]]:
-    """The outputs of all experiments, and their derivatives by the shared numbers and by each experiment's own."""
+    setting: Setting, predictor: AbstractPredictor, shared: Shared, own: Owns, told: PyTree
+) -> tuple[Outputs, Outputs, Outputs]:
+    """The outputs of all experiments, and in a last axis, their derivatives by the shared numbers and by each
+    experiment's own."""
 
     def one(shared, own, c):
-        return run_one(setting, diffrax.ForwardMode(), shared, own, c)
+        found = predictor(setting, shared, own, c)
+        return Outputs(found.values, found.variance)
 
-    return each_with_slopes(one, setting.layout.mesh, shared, own, conditions)
+    return each_with_slopes(one, setting.layout.mesh, shared, own, told)

@@ -12,7 +12,7 @@ from ..errors import InitializationError, ModelError, SimulationError, nearest
 from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
 from .objective import Objective
-from .program import Setting, placed, predict, run_end
+from .program import Runs, Setting, placed, predict, run_end
 
 
 def run(objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
@@ -67,7 +67,7 @@ def residuals(
             raise ModelError(f"the start of '{name}' is not unknown: " + nearest(name, layout.shared + layout.own))
     plain = dataclasses.replace(layout, parameters=(), modules=(), extra=())
     setting = Setting(model, objective.observers | observe, plain, objective.setting.fine)
-    outputs = predict(setting, adjoint, shared, own, objective.conditions)
+    outputs = predict(setting, Runs(adjoint), shared, own, objective.conditions).values
     sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)
     scaled = jnp.where(s.observed, (outputs - s.values) / sigma, 0.0)
     return {

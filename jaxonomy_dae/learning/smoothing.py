@@ -2,18 +2,19 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from ..errors import ModelError
-from .filter_objective import AheadObjective, FilterObjective
-from .filter_program import Track, go_on, read_states
+from .filter_data import Told
+from .filter_program import Ahead, Track, go_on, read_states
 from .objective import Objective
 from .prediction import Prediction, named
+from .program import Owns, Shared
 
 SINGULAR = 1e-12  # eigenvalues of a scaled covariance, relative to the largest, that count as none
 
@@ -23,8 +24,8 @@ def followed(
     steps: int, factor: float,
 ) -> Prediction:  # fmt: skip
     """Variables of an experiment: `"filtered"`, `"smoothed"` or `"ahead"` by a number of steps."""
-    kinds = (FilterObjective,) if how != "ahead" else (AheadObjective,)
-    if not isinstance(objective, AheadObjective) or not isinstance(objective, kinds):
+    ahead = objective.predictor
+    if not isinstance(ahead, Ahead) or not (ahead.has_variances or how == "ahead"):
         needed = "learning.Filter" if how != "ahead" else "learning.Filter or learning.Innovations"
         raise ModelError(f"{how} variables are those of Problem(method={needed}(...))")
     s = objective.stacked
@@ -32,7 +33,7 @@ def followed(
     count = s.counts[k]
     if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= count:
         raise ModelError(f"steps is a whole number from 1 to the {count} samples of this experiment; got {steps!r}")
-    found = jax.tree.map(lambda a: a[k, :count], objective.track(point))
+    found = jax.tree.map(lambda a: a[k, :count], objective.predictions(point))
     first = 0
     if how == "filtered":
         x, p, q = found.after, found.p_after, found.discrete
@@ -42,14 +43,14 @@ def followed(
     elif steps == 1:
         x, p, q = found.before, found.p_before, found.discrete
     else:
-        x, p, q = _further(objective, point, k, count, found, steps)
+        x, p, q = _further(objective, ahead, point, k, found, steps)
         first = steps
-    mean, spread = _read(objective, point, k, slice(first, count), names, x, p, q)
+    mean, spread = _read(objective, names, _numbers(objective, point, k, slice(first, count)), (x, p, q))
     times = s.times[k, :count]
     if first:  # nothing was predicted so far ahead of the first ones
         missing = np.full((first, len(names)), np.nan)
         mean, spread = np.concatenate([missing, mean]), np.concatenate([missing, spread])
-    if not isinstance(objective, FilterObjective):
+    if not ahead.has_variances:
         spread = np.full_like(spread, np.nan)
     return Prediction.of(times, names, mean, spread, factor)
 
@@ -75,7 +76,7 @@ def _inverse(p: Float[np.ndarray, "f f"]) -> Float[np.ndarray, "f f"]:
     return np.linalg.pinv(p / np.outer(size, size), rcond=SINGULAR, hermitian=True) / np.outer(size, size)
 
 
-def _numbers(objective: AheadObjective, point: Any, k: int, rows: slice) -> tuple[Any, Any, Any]:
+def _numbers(objective: Objective, point: Float[np.ndarray, " p"], k: int, rows: slice) -> tuple[Shared, Owns, Told]:
     """(shared, own, what programs are told) of one experiment, at some of its times."""
     shared, own = objective.numbers(objective.coordinates.natural(point))
     told = jax.tree.map(lambda a: a[k][None], objective.told)
@@ -86,20 +87,22 @@ def _numbers(objective: AheadObjective, point: Any, k: int, rows: slice) -> tupl
 
 
 def _further(
-    objective: AheadObjective, point: Any, k: int, count: int, found: Track, steps: int
-) -> tuple[Any, Any, Any]:
+    objective: Objective, ahead: Ahead, point: Float[np.ndarray, " p"], k: int, found: Track, steps: int
+) -> tuple[ArrayLike, ArrayLike, ArrayLike | None]:
     """States, covariances and discrete values that follow `steps` samples after the filtered ones."""
-    shared, own, told = _numbers(objective, point, k, slice(0, count))
+    shared, own, told = _numbers(objective, point, k, slice(0, len(found.before)))
     told = jax.tree.map(lambda a: a[0], told)
-    return go_on(objective.setting, objective.structure, steps, shared, own[0], told, found.after, found.p_after)
+    return go_on(objective.setting, ahead.structure, steps, shared, own[0], told, found)
 
 
 def _read(
-    objective: AheadObjective, point: Any, k: int, rows: slice, names: list[str], x: Any, p: Any, q: Any
-) -> tuple[np.ndarray, np.ndarray]:
-    shared, own, told = _numbers(objective, point, k, rows)
+    objective: Objective, names: list[str], numbers: tuple[Shared, Owns, Told],
+    states: tuple[ArrayLike, ArrayLike, ArrayLike | None],
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Means and standard deviations of variables at states with covariances and discrete values."""
+    shared, own, told = numbers
     setting = objective.setting._replace(layout=dataclasses.replace(objective.layout, outputs=tuple(names)))
-    batch = jax.tree.map(lambda a: jnp.asarray(a, told.times.dtype)[None], (x, p, q))
+    batch = jax.tree.map(lambda a: jnp.asarray(a, told.times.dtype)[None], states)
     found = read_states(setting, shared, own, told, *batch)
     mean, spread = (np.asarray(a[0], np.float64) for a in found)
     return mean, spread
