@@ -82,6 +82,41 @@ equation
 end 'Token';
 """
 
+# A step with two ways on, of which the first one counts if both are open, as in a state graph. Both open when the step
+# is reached, at t = 1, and are passed 1 s later: the first one at t = 2, so that the second one never is.
+WAYS = """model 'Ways'
+  Boolean 'begin'(start = true, fixed = true);
+  Boolean 'here'(start = false, fixed = true);
+  Boolean 'first'(start = false, fixed = true);
+  Boolean 'second'(start = false, fixed = true);
+  Boolean 'open 1';
+  Boolean 'open 2';
+  Boolean 'pass 1';
+  Boolean 'pass 2';
+  Boolean 'leaves';
+  discrete Real 'since 1'(start = 0.0, fixed = true);
+  discrete Real 'since 2'(start = 0.0, fixed = true);
+  Real 'y';
+equation
+  when 'open 1' then
+    'since 1' = time;
+  end when;
+  when 'open 2' then
+    'since 2' = time;
+  end when;
+  'leaves' = pre('begin') and time >= 1.0;
+  'open 1' = pre('here');
+  'pass 1' = 'open 1' and time >= 'since 1' + 1.0;
+  'open 2' = pre('here') and not 'pass 1';
+  'pass 2' = 'open 2' and time >= 'since 2' + 1.0;
+  'begin' = pre('begin') and not 'leaves';
+  'here' = 'leaves' or pre('here') and not ('pass 1' or 'pass 2');
+  'first' = 'pass 1' or pre('first');
+  'second' = 'pass 2' or pre('second');
+  'y' = if 'first' then 1.0 else 0.0;
+end 'Ways';
+"""
+
 # Functions with loops and branches, arrays, records, enumerations, tables, initial equations, an algorithm.
 PIPE = """package 'Heater'
   type 'Shape' = enumeration('Flat', 'Round' "with a comment");

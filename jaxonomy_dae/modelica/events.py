@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias, TypeVar
 
 import sympy
+from sympy.core.relational import Relational
 
 from ..aliases import Condition
 from ..errors import ModelError
@@ -119,12 +120,14 @@ def _hidden(scope: Scope, name: str, start: float) -> DiscreteSymbol:
     return DiscreteSymbol(name)
 
 
-def _with_whens(scope: Scope, value: Value) -> Value:
+def _with_whens(scope: Scope, value: Value, within: tuple[Branches, ...] = ()) -> Value:
     """The value of a mode where a `when` is due that assigns what the mode reads: equations and whens of an instant are
-    one system, so that a mode that makes the when happen does not meet the values before it."""
+    one system, so that a mode that makes the when happen does not meet the values before it. So does the condition of a
+    when that reads what another one assigns; `within` are those asked about already."""
+    found: list[Replacement] = []
     for s in _simple_whens(scope):
         targets = {DiscreteSymbol(n) for n in with_entries(assigned_in(s.branches[0][1]), scope.flat.model)}
-        if not isinstance(value, sympy.Basic) or not value.free_symbols & targets:
+        if s in within or not isinstance(value, sympy.Basic) or not value.free_symbols & targets:
             continue
         condition = scope.evaluate(s.branches[0][0])
         if isinstance(condition, bool | Sampled) or not is_condition(condition):
@@ -134,8 +137,32 @@ def _with_whens(scope: Scope, value: Value) -> Value:
             done = scope.done[s] = _hidden(scope, f":done[{len(scope.done)}]", 1)
             ends = scope.kept.in_events(both(negated(condition), plain(sympy.Ne(done, 0))))
             scope.component._event(ends, (assign(done, 0),), None, EventFlag.AT_START | EventFlag.REVOCABLE)
+        due = both(_with_whens(scope, condition, (*within, s)), plain(sympy.Eq(done, 0)))
         new = {a.target: a.value.xreplace(_present(a.value)) for a in _actions(scope, s.branches[0][1], True)}
-        value = chosen(both(condition, plain(sympy.Eq(done, 0))), value.xreplace(new), value)
+        found.append((due, new))
+    return _replaced(value, found) if found else value
+
+
+Replacement: TypeAlias = tuple[
+    Value, dict[sympy.Basic, sympy.Basic]
+]  # a condition; what stands for symbols if it holds
+
+
+def _replaced(value: sympy.Basic, replacements: list[Replacement]) -> Value:
+    """A value after replacements on their conditions. Each relation is chosen by itself where no symbol stands outside
+    of relations, so that all else stands once."""
+    relations = value.atoms(Relational)
+    outside = value.xreplace({r: sympy.Dummy() for r in relations}).free_symbols
+    if any(outside & new.keys() for _, new in replacements):
+        return _chosen_of(value, replacements)
+    return plain(value.xreplace({r: sympy.sympify(_chosen_of(r, replacements)) for r in relations}))
+
+
+def _chosen_of(value: Value, replacements: list[Replacement]) -> Value:
+    for k, (due, new) in enumerate(replacements):
+        if isinstance(value, sympy.Basic) and value.free_symbols & new.keys():
+            rest = replacements[k + 1 :]
+            return chosen(due, _chosen_of(plain(value.xreplace(new)), rest), _chosen_of(value, rest))
     return value
 
 

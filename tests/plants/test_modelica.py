@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modelica_texts import BALL, BLOCK, PIPE, TOKEN
+from modelica_texts import BALL, BLOCK, PIPE, TOKEN, WAYS
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
 from jaxonomy_dae.modelica import FlatComponent, load
@@ -60,6 +60,16 @@ def test_modes_that_hand_on_a_token_change_at_once():
     np.testing.assert_array_equal(solution["m.b"], 1 - np.asarray(solution["m.a"]))
     np.testing.assert_array_equal(solution["m.y"], solution["m.a"])
     np.testing.assert_allclose([solution["m.ta"][-1], solution["m.tb"][-1]], [3.0, 2.5], atol=1e-9)
+
+
+@pytest.mark.long("modes that change at once, and two whens of one instant")
+def test_a_when_that_rests_on_what_another_one_assigns_at_the_same_instant():
+    """Whether the second way is open was judged by the time since which the first one was open before it opened: the
+    second one seemed closed, so that its own time was not set, and it was passed at once."""
+    solution = simulate(compiled(WAYS), 3.0, ts=jnp.array([0.5, 1.5, 1.99, 2.01, 2.9]))
+    assert solution["m.here"].tolist() == [0, 1, 1, 0, 0]
+    assert solution["m.first"].tolist() == [0, 0, 0, 1, 1]
+    assert solution["m.second"].tolist() == [0, 0, 0, 0, 0]
 
 
 WHENS = """model 'Whens'
