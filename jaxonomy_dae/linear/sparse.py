@@ -29,6 +29,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, Float
 
 from ..errors import MissingPackage, ModelError
+from ..programs.recalled import REGISTERED
 
 EXTRA = 'pip install "jaxonomy_dae[sparse]"'
 DENSE = 1000  # simultaneous equations that dense elimination may solve if there is no sparse solver: about 20 ms
@@ -173,6 +174,9 @@ def klu() -> Any:
     # is not to become one of these.
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(_imported).result()
+
+
+REGISTERED["klu"] = klu
 
 
 def _imported() -> Any:

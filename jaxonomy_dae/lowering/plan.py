@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import lineax as lx
@@ -129,6 +129,10 @@ class SystemPlan:
     def digest(self) -> str:
         """A digest of the structure, the same in every process; functions in it are told apart by names alone."""
         return self._identity.digest
+
+    def told(self) -> tuple[str, tuple[Callable, ...]]:
+        """What is the same in every process: see `programs.lasting`."""
+        return self._identity.digest, self._identity.functions
 
     @property
     def flat(self) -> FlatModel:

@@ -2,8 +2,8 @@
 
 Given a tree of records, containers, arrays, templates and texts, returns a digest that two trees share only if they are
 equal in every part, and the functions in them. There is no list of what counts: a record counts with all its fields, an
-array with its dtype, shape and entries, an expression by its canonical form, a function as the object that it is. What
-is of no known type is refused, so that nothing is forgotten.
+array with its dtype, shape and entries, an expression by its canonical form, a function or a class as the object that
+it is. What is of no known type is refused, so that nothing is forgotten.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from .template import AbstractTemplate
 
 @dataclasses.dataclass(frozen=True)
 class Identity:
-    """The digest of a tree, and the functions in it in the order in which the walk meets them."""
+    """The digest of a tree, and the functions and classes in it in the order in which the walk meets them."""
 
     digest: str
     functions: tuple[Callable, ...]
@@ -67,7 +67,7 @@ class _Walk:
         return self._seen[id(part)][1]
 
     def _of(self, part: object) -> bytes:
-        name = type(part).__qualname__
+        name = f"{type(part).__module__}.{type(part).__qualname__}"
         match part:
             case np.ndarray() if part.dtype == object:
                 return self._all(f"{name} {part.shape}", part.ravel().tolist())
@@ -85,7 +85,7 @@ class _Walk:
             case enum.Enum():
                 return _digest(name, repr(part.value).encode())
             case type():
-                return _digest("type", f"{part.__module__}.{part.__qualname__}".encode())
+                return _digest("type", self._class(part))
             case Node():
                 return _digest(name, part.digest)
             case AbstractTemplate():
@@ -99,7 +99,9 @@ class _Walk:
             case types.BuiltinMethodType() if not isinstance(part.__self__, types.ModuleType | None):
                 return self._all(f"method {part.__name__}", [part.__self__])  # of a list, say
         if dataclasses.is_dataclass(part):
-            return self._all(name, [getattr(part, field.name) for field in dataclasses.fields(part)])
+            kind: Any = type(part)
+            of = b"" if kind.__module__.startswith(PACKAGE) else self._class(kind)
+            return _digest(name, of, *(self.digest(getattr(part, field.name)) for field in dataclasses.fields(kind)))
         if type(part).__module__.startswith(PACKAGE):
             return self._all(name, _attributes(part))
         if callable(part):
@@ -111,8 +113,12 @@ class _Walk:
         digests = {key: self.digest(part) for key, part in each.items()}
         return _digest(name, b"".join([digests[id(part)] for part in parts]))
 
+    def _class(self, kind: type) -> bytes:
+        """A class, which may be one of the user's: two of them may have one name."""
+        return self._number(kind) + f"{kind.__module__}.{kind.__qualname__}".encode()
+
     def _number(self, function: Callable) -> bytes:
-        """The place of a function among those met so far."""
+        """The place of a function, or of a class, among those met so far."""
         place = next((k for k, other in enumerate(self.functions) if other == function), len(self.functions))
         if place == len(self.functions):
             self.functions.append(function)

@@ -19,8 +19,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..aliases import PyTree
+from .kept import folder
+from .lasting import lasting
 from .machine import Use, mappings, memory, return_memory
-from .reasons import reason
+from .reasons import Place, reason
 from .staging import is_traced
 from .transformed import Function
 
@@ -36,8 +38,6 @@ PAUSE = 100  # a measurement takes some 2 µs for each mapping, up to 0.1 s; 1 %
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-_ARRAY = object()  # stands where an array was
-
 
 class _Called:
     """A function for certain static values; `calls` counts the calls that have not returned yet."""
@@ -45,12 +45,13 @@ class _Called:
     def __init__(self, function: Callable, runs_once: bool, structure: Any, static: tuple[Any, ...], why: str):
         def run(arrays: list[Array]) -> PyTree:
             rest = iter(arrays)
-            leaves = [next(rest) if leaf is _ARRAY else leaf for leaf in static]
+            leaves = [next(rest) if leaf is Place.ARRAY else leaf for leaf in static]
             args, kwargs = jax.tree.unflatten(structure, leaves)
             return function(*args, **kwargs)
 
         self.calls = 0
-        self.function = Function(run, getattr(function, "__name__", "run"), why, runs_once)
+        identity = None if folder() is None else lasting(function, structure, static)
+        self.function = Function(run, getattr(function, "__name__", "run"), why, runs_once, identity)
 
 
 def _surroundings(arrays: list[Array]) -> Hashable:
@@ -81,7 +82,7 @@ class ProgramCache:
         leaves, structure = jax.tree.flatten((args, kwargs))
         # Those of NumPy, such as weights of a user's, lie nowhere yet.
         arrays = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
-        static = tuple(_ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
+        static = tuple(Place.ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
         key = function, structure, static, tuple(jax.typeof(a) for a in arrays), _surroundings(arrays)
         with self._lock:
             program = self._programs.get(key)

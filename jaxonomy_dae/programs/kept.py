@@ -2,7 +2,8 @@
 
 A file holds an executable that XLA made for one processor. Its name is a digest of the program as StableHLO, the
 compiler's options, the versions of JAX and its library, the platform, and the processor's features, so that no other
-processor loads it. Where the user has chosen a folder for JAX's own compilation cache, that one serves instead.
+processor loads it. Another file says which executable a call needs (`lasting.py`), so that the call need not be traced
+to find it. Where the user has chosen a folder for JAX's own compilation cache, that one serves instead.
 """
 
 import contextlib
@@ -14,11 +15,11 @@ import struct
 import sys
 import tempfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-from jax import Array
 
 from ..private_names import MissingName, private
 
@@ -75,12 +76,13 @@ def _machine() -> str:
     return f"{machine.system()} {machine.machine()} {processor}"
 
 
-def key(text: bytes) -> str | None:
-    """A digest of a program, as StableHLO, and all that its machine code depends on; None if programs are not kept."""
+def key(program: str) -> str | None:
+    """A digest of a program, told by another digest, and all that its machine code depends on; None if programs are not
+    kept."""
     if folder() is None:
         return None
     told = machine_and_versions() | {"flags": os.environ.get("XLA_FLAGS", "")}
-    return hashlib.sha256(text + repr(sorted(told.items())).encode()).hexdigest()
+    return hashlib.sha256(f"{program} {sorted(told.items())}".encode()).hexdigest()
 
 
 def machine_and_versions() -> dict[str, str]:
@@ -104,41 +106,69 @@ def save(key: str | None, options: dict[str, Any], run: Any, cost: float) -> Non
     """Keeps an executable, and the processor seconds that it cost, if there is a folder for it. Nothing that goes wrong
     here matters."""
     path = None if key is None else _path(key, options)
-    if path is None:
-        return
-    with contextlib.suppress(Exception):  # a full disk, no permission, an executable that cannot be serialized
-        content, _, _ = private("serialize_executable")(run)
+    if path is not None:
+        with contextlib.suppress(Exception):  # an executable that cannot be serialized
+            content, _, _ = private("serialize_executable")(run)
+            _write(path, struct.pack("<d", cost) + zlib.compress(content, 1))
+
+
+def load(key: str | None, options: dict[str, Any], outputs: int, arrays: Sequence[Any]) -> tuple[Any, float] | None:
+    """The executable that an earlier process has kept, and what it cost; None if there is none, or it is not whole.
+    It takes a list of such arrays, and returns a list of so many."""
+    path = None if key is None else _path(key, options)
+    content = None if path is None else _read(path)
+    if path is None or content is None:
+        return None
+    try:
+        devices = sorted({d for a in arrays for d in a.sharding.device_set}, key=lambda d: d.id) or jax.devices()[:1]
+        trees = jax.tree.structure(((list(arrays),), {})), jax.tree.structure([0] * outputs)
+        found = private("deserialize_executable")(zlib.decompress(content[8:]), *trees, execution_devices=devices)
+    except MissingName:
+        return None
+    except Exception:  # written by something else
+        _delete(path)
+        return None
+    return found, struct.unpack("<d", content[:8])[0]
+
+
+def save_record(key: str, content: bytes | None) -> None:
+    """Keeps what is known of a program beside its executable."""
+    path = _path(key, {})
+    if path is not None and content is not None:
+        _write(path, content)
+
+
+def load_record(key: str | None) -> bytes | None:
+    """What an earlier process has kept of a program; None if there is none, or it is not whole."""
+    path = None if key is None else _path(key, {})
+    return None if path is None else _read(path)
+
+
+def _write(path: Path, content: bytes) -> None:
+    with contextlib.suppress(OSError):  # a full disk, no permission
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        content = struct.pack("<d", cost) + zlib.compress(content, 1)
-        digest = hashlib.sha256(content).digest()
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix="new-", delete=False) as file:
-            file.write(digest + content)
+            file.write(hashlib.sha256(content).digest() + content)
         os.replace(file.name, path)
         _make_room(path.parent)
 
 
-def load(key: str | None, options: dict[str, Any], lowered: Any, arrays: list[Array]) -> tuple[Any, float] | None:
-    """The executable that an earlier process has kept, and what it cost; None if there is none, or it is not whole."""
-    path = None if key is None else _path(key, options)
-    if path is None or not path.exists():
-        return None
+def _read(path: Path) -> bytes | None:
+    """The content of a file; a file that is not whole is deleted."""
     try:
-        content = path.read_bytes()
-        digest, content = content[:32], content[32:]
-        if hashlib.sha256(content).digest() != digest:
-            raise ValueError("not whole")
-        devices = sorted({d for a in arrays for d in a.sharding.device_set}, key=lambda d: d.id) or jax.devices()[:1]
-        found = private("deserialize_executable")(
-            zlib.decompress(content[8:]), lowered.in_tree, lowered.out_tree, execution_devices=devices
-        )
+        whole = path.read_bytes()
         os.utime(path)
-    except MissingName:
+    except OSError:
         return None
-    except Exception:  # written by something else, or half
-        with contextlib.suppress(OSError):
-            path.unlink()
-        return None
-    return found, struct.unpack("<d", content[:8])[0]
+    if hashlib.sha256(whole[32:]).digest() == whole[:32]:
+        return whole[32:]
+    _delete(path)
+    return None
+
+
+def _delete(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        path.unlink()
 
 
 def _make_room(where: Path) -> None:

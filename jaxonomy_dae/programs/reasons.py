@@ -1,5 +1,6 @@
 """Why a call needs another program, in words."""
 
+import enum
 from collections.abc import Hashable, Iterable
 from typing import Any
 
@@ -7,6 +8,12 @@ import jax
 
 SHOWN = 3  # arguments that a reason lists
 WIDTH = 60  # characters of a value in a reason
+
+
+class Place(enum.Enum):
+    """What stands among static values where an array was."""
+
+    ARRAY = 0
 
 
 def reason(key: tuple[Any, ...], known: Iterable[Hashable]) -> str:
@@ -23,7 +30,7 @@ def reason(key: tuple[Any, ...], known: Iterable[Hashable]) -> str:
     paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(
         jax.tree.unflatten(structure, static)
     )[0]]  # fmt: skip
-    arrays = [path for path, leaf in zip(paths, static, strict=True) if type(leaf) is object]
+    arrays = [path for path, leaf in zip(paths, static, strict=True) if leaf is Place.ARRAY]
     changed = [
         f"{p} was {_short(a)}, is {_short(b)}" for p, a, b in zip(paths, other[2], static, strict=True) if a != b
     ]

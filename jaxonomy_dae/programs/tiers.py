@@ -10,6 +10,7 @@ Competitive snoopy caching, Algorithmica 3). The outcomes of both differ by roun
 import atexit
 import contextlib
 import functools
+import hashlib
 import os
 import threading
 import time
@@ -25,7 +26,9 @@ from ..aliases import PyTree
 from ..private_names import constants
 from . import kept
 from .compilations import Compilation, noted, timed
+from .lasting import types_of
 from .platform import platform
+from .recalled import called, recalled, record, register
 from .staging import is_traced
 
 # XLA's older code generator for CPUs makes one kernel of what the newer one makes several, and LLVM leaves out its
@@ -57,10 +60,19 @@ class Program:
     """A function of a list of arrays that returns any pytree, compiled for the shapes of its first call.
 
     `arrays` are those of the first call; `why` says what made the program necessary. `runs_once` False: it is
-    optimized at once. `stands_alone` False: it is not compiled, and cannot be called.
+    optimized at once. `stands_alone` False: it is not compiled, and cannot be called. `identity`: a digest of what the
+    function computes (`lasting.py`), or None: an earlier process may have kept the program.
     """
 
-    def __init__(self, function: Callable[..., PyTree], arrays: list[Array], name: str, why: str, runs_once: bool):
+    def __init__(
+        self,
+        function: Callable[..., PyTree],
+        arrays: list[Array],
+        name: str,
+        why: str,
+        runs_once: bool,
+        identity: str | None = None,
+    ):
         self._name, self._why = name, why
         self._outcome: PyTree = None  # structure, and what is not an array
 
@@ -71,40 +83,85 @@ class Program:
             return [leaf for leaf in leaves if eqx.is_array(leaf)]
 
         flat.__name__ = flat.__qualname__ = name  # what profiles and errors show
+        self._flat = flat
+        self._arrays = [
+            jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=a.sharding, weak_type=a.weak_type) for a in arrays
+        ]
+        self._lowered: Any = None
+        self._times = 0.0, 0.0
+        self._spent, self._switching = 0.0, False
+        self._lock = threading.Lock()
+        self._cost = 0.0
+        self.stands_alone = True
+        on_cpu = all(device.platform == "cpu" for a in arrays for device in a.devices())
+        # What an earlier process has optimized is as good as new.
+        tiers = [{}, *([quick()] if runs_once and on_cpu and quick() else [])]
+        known = None if identity is None else kept.key(f"{identity} {types_of(arrays)}")
+        if self._recalled(known, tiers):
+            return
+        text = self._staged(arrays)
+        if not self.stands_alone:
+            return
+        self._text = hashlib.sha256(text).hexdigest()
+        if not self._read(tiers):
+            self._take(*self._compiled(tiers[-1]))
+        if known is not None:
+            kept.save_record(known, record(self._text, called(text), self._outcome))
+
+    def _take(self, run: Callable[..., Any], options: dict[str, Any], doubted: bool = False) -> None:
+        """Runs this executable from now on. One that was read may not run (`doubted`)."""
+        self._run, self._options, self._doubted = run, options, doubted
+        if not options and not doubted:
+            self._lowered = None  # nothing is left to be compiled
+
+    def _staged(self, arrays: list[Any]) -> bytes:
+        """Traces and lowers the program; returns it as StableHLO."""
         with timed() as traced:
-            stage = jax.jit(flat).trace(arrays)
+            stage = jax.jit(self._flat).trace(arrays)
         with timed() as lowered:
-            self._lowered: Any = stage.lower()
+            self._lowered = stage.lower()
             text = self._lowered.as_text().encode()
         # Python is called from it, or it needs a value that is traced around it.
         self.stands_alone = kept.CALLBACK not in text and not is_traced(constants(stage))
-        if not self.stands_alone:
-            return
         self._times = traced[0], lowered[0]
-        self._spent, self._switching = 0.0, False
-        self._lock = threading.Lock()
-        self._key = kept.key(text)
-        self._cost = 0.0
-        on_cpu = all(device.platform == "cpu" for a in arrays for device in a.devices())
-        options = quick() if runs_once and on_cpu else {}
-        # What an earlier process has optimized is as good as new.
-        run = self._loaded({}, arrays)
-        if run is not None:
-            options = {}
-        elif options:
-            run = self._loaded(options, arrays)
-        self._doubted = None if run is None else options
-        if run is None:
-            run, options = self._compiled(options)
-        self._run = run
-        self._arrays = [jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=a.sharding) for a in arrays]
-        if not options and self._doubted is None:
-            self._lowered = None
+        return text
 
-    def _loaded(self, options: dict[str, Any], arrays: list[Any]) -> Callable[..., PyTree] | None:
+    def _recalled(self, known: str | None, tiers: list[dict[str, Any]]) -> bool:
+        """Reads what an earlier process knew of this program, and its executable. True if both are there."""
+        content = kept.load_record(known)
+        found = None if content is None else recalled(content)
+        if found is None:
+            return False
+        self._text, calls, self._outcome = found
+        with timed() as spent:
+            known_calls = register(calls)
+        self._times = spent[0], 0.0
+        return known_calls and self._read(tiers)
+
+    def restaged(self) -> PyTree:
+        """Traces a program that was recalled, so that it can be compiled. Returns its outcome (structure, and what is
+        no array); None if it has become another program."""
+        before = self._outcome
+        text = self._staged([jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in self._arrays])
+        outcome, self._outcome = self._outcome, before  # the calls to come return what those before did
+        if self.stands_alone and hashlib.sha256(text).hexdigest() == self._text:
+            return outcome
+        self._lowered, self.stands_alone = None, True
+        return None
+
+    def _read(self, tiers: list[dict[str, Any]]) -> bool:
+        """Reads the best executable that an earlier process has kept. True if there is one."""
+        for options in tiers:
+            run = self._loaded(options)
+            if run is not None:
+                self._take(run, options, doubted=True)
+                return True
+        return False
+
+    def _loaded(self, options: dict[str, Any]) -> Callable[..., PyTree] | None:
         """The executable that an earlier process has kept; None if there is none."""
         with timed() as spent:
-            found = kept.load(self._key, options, self._lowered, arrays)
+            found = kept.load(kept.key(self._text), options, sum(self._outcome[2]), self._arrays)
         if found is None:
             return None
         self._note("loaded", spent[0])
@@ -124,7 +181,7 @@ class Program:
                 run = self._lowered.compile()
         self._note("quick" if options else "optimized", spent[0])
         self._cost = spent[0]
-        kept.save(self._key, options, run, spent[0])
+        kept.save(kept.key(self._text), options, run, spent[0])
         return run, options
 
     def _note(self, how: str, seconds: float) -> None:
@@ -132,9 +189,9 @@ class Program:
         self._times = 0.0, 0.0  # counted once
 
     def __call__(self, arrays: list[Any]) -> PyTree:
-        if self._doubted is not None:
+        if self._doubted:
             found = self._first_run(arrays)
-        elif self._lowered is None:
+        elif not self._options:
             found = self._run(arrays)
         else:
             begin = time.process_time()
@@ -149,15 +206,15 @@ class Program:
 
     def _first_run(self, arrays: list[Array]) -> PyTree:
         """The first run of an executable that was read: one that does not run is compiled anew."""
-        options, self._doubted = self._doubted, None
         try:
-            return jax.block_until_ready(self._run(arrays))
+            found = jax.block_until_ready(self._run(arrays))
         except jax.errors.JaxRuntimeError:
-            self._run, options = self._compiled(options or {})
+            if self._lowered is None and self.restaged() is None:
+                raise
+            self._take(*self._compiled(self._options))
             return self._run(arrays)
-        finally:
-            if not options:
-                self._lowered = None
+        self._take(self._run, self._options)
+        return found
 
     def _reconsider(self) -> None:
         """Starts a thread that compiles the optimized program, if the runs have taken as long as this would."""
@@ -165,14 +222,14 @@ class Program:
             if self._switching or self._spent < OPTIMIZED * self._cost:
                 return
             self._switching = True
-        _start(self._optimize)
+        with contextlib.suppress(Exception):  # what cannot be traced any more stays as it is
+            # Not in the thread, which does not have JAX's options of this one.
+            if self._lowered is not None or self.restaged() is not None:
+                _start(self._optimize)
 
     def _optimize(self) -> None:
-        lowered = self._lowered
-        if lowered is None:
-            return
         with contextlib.suppress(Exception):  # of memory that is short: the quick program goes on
-            self._run = self._loaded({}, self._arrays) or self._compiled({})[0]
+            self._take(self._loaded({}) or self._compiled({})[0], {})
         self._lowered = None
 
 

@@ -30,18 +30,27 @@ class Function:
 
     - `name`: what profiles and records show; `why`: what made it necessary.
     - `runs_once`: its runs are expected to take less time than its compilation does.
+    - `identity`: a digest of what it computes, the same in every process (`lasting.py`); None if it has none.
     """
 
-    def __init__(self, function: Callable[[list[PyTree]], PyTree], name: str, why: str, runs_once: bool):
+    def __init__(
+        self,
+        function: Callable[[list[PyTree]], PyTree],
+        name: str,
+        why: str,
+        runs_once: bool,
+        identity: str | None = None,
+    ):
         def run(arrays: list[Array]) -> PyTree:
             return function(arrays)
 
         run.__name__ = run.__qualname__ = name
-        self.function, self.name, self.why, self.runs_once = function, name, why, runs_once
+        self.function, self.name, self.why, self.runs_once, self.identity = function, name, why, runs_once, identity
         self._transformed: Any = eqx.filter_jit(run)  # for what JAX transforms
         self._program: Program | None = None
         self._derived: dict[Hashable, Function] = {}
         self.known = 0  # of `_pushed`: the first so many arrays are not directions
+        self.pulls = False  # a part of a derivative in reverse mode: what is derived from it has no identity
 
     def __call__(self, arrays: list[Any]) -> PyTree:
         arrays = [a if isinstance(a, jax.Array) else jax.device_put(a) for a in arrays]  # JAX' own kind of float
@@ -55,8 +64,25 @@ class Function:
         if kind or not _is_plain(arrays):
             return self._transformed(arrays)
         if self._program is None:
-            self._program = Program(self.function, arrays, self.name, self.why, self.runs_once)
+            self._program = Program(self.function, arrays, self.name, self.why, self.runs_once, self.identity)
         return self._program(arrays) if self._program.stands_alone else self._transformed(arrays)
+
+    def regained(self) -> Any:
+        """The structure of the pullback that belongs to what a program from an earlier process returned.
+
+        **Raises:**
+
+        - `LostStructure` if that program would be another one now.
+        """
+        outcome = None if self._program is None else self._program.restaged()
+        if outcome is None:
+            raise LostStructure
+        structure, fixed, _ = outcome
+        return jax.tree.unflatten(structure, fixed)[2].structure.value
+
+    def forget(self) -> None:
+        """Lets go of a program from an earlier process: the next call traces it anew."""
+        self._program = self.identity = None
 
     def clear(self) -> None:
         """Frees what was compiled."""
@@ -66,9 +92,13 @@ class Function:
             one.clear()
         self._derived.clear()
 
-    def _derive(self, key: Hashable, function: Callable[[list[PyTree]], PyTree], name: str) -> "Function":
+    def _derive(
+        self, key: Hashable, function: Callable[[list[PyTree]], PyTree], name: str, told: str | None = None
+    ) -> "Function":
+        """The derivative or batch of this key; in all processes, `told` tells it from others of this function."""
         if key not in self._derived:
-            self._derived[key] = Function(function, name, self.why, self.runs_once)
+            identity = None if told is None or self.identity is None or self.pulls else f"{self.identity} {told}"
+            self._derived[key] = Function(function, name, self.why, self.runs_once, identity)
         return self._derived[key]
 
     def _differentiated(self, arrays: list[Array]) -> PyTree:
@@ -76,7 +106,10 @@ class Function:
         chosen = tuple(
             k for k, a in enumerate(arrays) if is_traced(a) and jnp.issubdtype(a.dtype, jnp.inexact)
         )  # fmt: skip
-        values = self._derive(("values", chosen), lambda arrays: _values(self.function, chosen, arrays), self.name)
+        values = self._derive(
+            ("values", chosen), lambda arrays: _values(self.function, chosen, arrays), self.name, f"values {chosen}"
+        )
+        values.pulls = True
         shape: list[PyTree] = []  # what the outcome is, beside its arrays
 
         @jax.custom_vjp
@@ -84,12 +117,20 @@ class Function:
             return values([*arrays])[0]
 
         def forward(*given: PyTree) -> PyTree:
-            smooth, rest, pullback = values([one.value for one in given])
+            known = [one.value for one in given]
+            smooth, rest, pullback = values(known)
             shape[:] = [rest]
-            leaves, structure = jax.tree.flatten(pullback)
-            return smooth, _Residuals(leaves, structure)
+            return smooth, (pullback, known if pullback.structure.value is None else [])
 
-        def backward(residuals: _Residuals, cotangents: list[PyTree]) -> PyTree:
+        def backward(residuals: tuple["_Pullback", list[Array]], cotangents: list[PyTree]) -> PyTree:
+            pullback, known = residuals
+            try:
+                return pulled_through(pullback, cotangents)
+            except LostStructure:
+                values.forget()
+                return pulled_through(values(known)[2], cotangents)
+
+        def pulled_through(residuals: "_Pullback", cotangents: list[PyTree]) -> PyTree:
             # JAX would make arrays of zeros for what is not read, by a program for each shape.
             read = tuple(not isinstance(c, SymbolicZero) for c in cotangents)
             leaves, structure = residuals.leaves, residuals.structure
@@ -101,7 +142,8 @@ class Function:
                     return pulled_back(arrays)
 
             def pulled_back(arrays: list[Array]) -> list[PyTree]:
-                pullback = jax.tree.unflatten(structure, arrays[:n])
+                whole_structure = values.regained() if structure.value is None else structure.value
+                pullback = jax.tree.unflatten(whole_structure, arrays[:n])
 
                 def pulled_by(zeros: list[PyTree]) -> list[PyTree]:
                     given = iter(arrays[n:])
@@ -112,7 +154,11 @@ class Function:
                 except (TypeError, ValueError):  # JAX 0.10.2 takes a stacked zero of a scan for one of its steps
                     return pulled_by([jnp.zeros(c.shape, c.dtype) for c in cotangents])
 
-            transpose = values._derive(("pullback", read, structure, whole), pulled, f"gradient of {self.name}")
+            values.pulls = False
+            transpose = values._derive(
+                ("pullback", read, structure, whole), pulled, f"gradient of {self.name}", f"pullback {read} {whole}"
+            )
+            values.pulls = transpose.pulls = True
             found = iter(transpose([*leaves, *(c for c, r in zip(cotangents, read, strict=True) if r)]))
             return tuple(next(found) if k in chosen else None for k in range(len(arrays)))
 
@@ -142,7 +188,9 @@ class Function:
             structure, fixed = split
             return (smooth, (_Static(structure), eqx.combine(others, fixed))), slopes
 
-        pushed = self._derive(("tangents", chosen), along, f"derivative of {self.name}")
+        pushed = self._derive(
+            ("tangents", chosen), along, f"derivative of {self.name}", f"tangents {chosen}"
+        )  # fmt: skip
         pushed.known = n
         rest: list[PyTree] = []
 
@@ -184,7 +232,8 @@ class Function:
                 moving = (jax.tree.map(lambda rows: rows[0], moving[0]), moving[1])
             return moving, fixed[0]
 
-        moving, rest = self._derive(("batch", size, tuple(axes)), many, f"batch of {self.name}")(values)
+        told = f"batch {size} {axes} {self.known}"
+        moving, rest = self._derive(("batch", size, tuple(axes)), many, f"batch of {self.name}", told)(values)
         differs = jax.tree.map(lambda rows: True, moving)
         if alike:
             differs = (jax.tree.map(lambda value: False, moving[0]), differs[1])
@@ -201,11 +250,31 @@ class Function:
         return eqx.combine(member(arrays[k]), rest)
 
 
-class _Residuals(eqx.Module):
+class LostStructure(Exception):
+    """The structure of a pullback is needed, and the program that made its arrays cannot be traced again."""
+
+
+class _Structure:
+    """The structure of a pullback: programs, which are not written to files. There, `value` is None."""
+
+    def __init__(self, value: Any = None):
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Structure) and self.value == other.value
+
+    def __hash__(self) -> int:
+        return hash(self.value)
+
+    def __reduce__(self):
+        return _Structure, ()
+
+
+class _Pullback(eqx.Module):
     """The arrays of a pullback, and its structure."""
 
     leaves: list[PyTree]
-    structure: Any = eqx.field(static=True)
+    structure: _Structure = eqx.field(static=True)
 
 
 def _values(function: Callable[[list[PyTree]], PyTree], chosen: tuple[int, ...], arrays: list[Array]) -> PyTree:
@@ -223,7 +292,8 @@ def _values(function: Callable[[list[PyTree]], PyTree], chosen: tuple[int, ...],
     shape: list[PyTree] = []
     smooth, pullback, others = jax.vjp(of, *(arrays[k] for k in chosen), has_aux=True)
     structure, fixed = shape
-    return smooth, (_Static(structure), eqx.combine(others, fixed)), pullback
+    leaves, of_pullback = jax.tree.flatten(pullback)
+    return smooth, (_Static(structure), eqx.combine(others, fixed)), _Pullback(leaves, _Structure(of_pullback))
 
 
 class _Static(eqx.Module):

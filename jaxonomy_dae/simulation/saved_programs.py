@@ -9,13 +9,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ..aliases import PyTree
 from ..errors import ModelError
-from ..linear.sparse import klu
 from ..private_names import private
 from ..programs.kept import CALLBACK, machine_and_versions
+from ..programs.recalled import register
 
 MARK = b"jaxonomy_dae program 1\n"
 
@@ -74,7 +73,7 @@ def load_compiled(path: str | PathLike[str]) -> Any:
                 f"load_compiled: '{path}' was made for another {what}{found}. Compile and save it again here, or use "
                 "jax.export"
             )
-    _register(told["calls"])
+    register(told["calls"])
     arguments, results = map(jax.tree.structure, pickle.loads(trees))
     return _loaded(content, arguments, results)
 
@@ -93,11 +92,3 @@ def _try(compiled: Any, loaded: Any) -> None:
             f"save_compiled: what JAX writes of this program does not run ({error}), as where it was read from JAX's "
             "persistent cache. Compile it in a process that does not set jax_compilation_cache_dir"
         ) from error
-
-
-def _register(targets: list[str]) -> None:
-    """Makes known what a program calls: without this, a fresh process crashes at its first run."""
-    if any(target.startswith("lapack") for target in targets):
-        jax.jit(jnp.linalg.inv).lower(np.eye(1))
-    if any("klu" in target for target in targets):
-        klu()

@@ -1,0 +1,257 @@
+"""Programs that a later process finds without tracing them.
+
+Kind of defect: a second process traced every program again to find its executable, half of what the first one took. The
+fault to fear is the other one: a program that is found for a call that computes something else.
+"""
+
+import dataclasses
+import sys
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from problems import run
+
+from benchmarks.attack.invariance.declarations import PAIRS, STRUCTURE, built
+from jaxonomy_dae import solvers
+from jaxonomy_dae.programs import kept, lasting, tiers
+from jaxonomy_dae.programs.cache import ProgramCache
+from jaxonomy_dae.programs.compilations import compilations
+from jaxonomy_dae.programs.lasting import types_of
+
+FORM, TRACES = [jnp.sin], []
+
+
+def wave(x, k):
+    """f(k·x) twice, and which of the results are positive; f may be another one in another process."""
+    TRACES.append(FORM[0])
+    y = FORM[0](k * FORM[0](k * x))
+    return {"y": y, "twice": 2 * k * y, "positive": y > 0, "name": "wave"}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder in which programs are kept, and no cache of JAX's own; this file counts as one of a library."""
+    by_jax = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    compilation_cache.reset_cache()
+    jax.config.update("jax_compilation_cache_dir", None)
+    kept.keep_programs(tmp_path / "programs")
+    monkeypatch.setattr(lasting, "LIBRARIES", (*lasting.LIBRARIES, __name__))
+    monkeypatch.setattr(tiers, "_chosen_by_the_user", lambda: False)
+    monkeypatch.setattr(sys.modules[__name__], "FORM", [jnp.sin])
+    TRACES.clear()
+    yield
+    compilation_cache.reset_cache()
+    jax.config.update("jax_compilation_cache_dir", by_jax)
+    kept._CHOSEN.clear()
+
+
+def loss(programs, part, x, k):
+    return jnp.sum(programs.call(wave, True, (x, k), {})[part] ** 2)
+
+
+X, K = np.linspace(-1.0, 1.0, 3), 1.1
+
+
+def test_a_call_is_not_traced_again(folder):
+    """Another cache of programs stands for another process: the outcome is the same to the last bit."""
+    first = ProgramCache().call(wave, True, (jnp.asarray(X), jnp.array(K)), {})
+    traced, since = len(TRACES), len(compilations())
+    second = ProgramCache().call(wave, True, (jnp.asarray(X), jnp.array(K)), {})
+    assert len(TRACES) == traced and [c.how for c in compilations()[since:]] == ["loaded"]
+    assert second["name"] == "wave" and second["positive"].dtype == bool
+    for name in ("y", "twice", "positive"):
+        np.testing.assert_array_equal(first[name], second[name])
+
+
+DERIVATIVES = {
+    "reverse": lambda f, k: jax.grad(f)(k),
+    "forward": lambda f, k: jax.jacfwd(f)(k),
+    "batch": lambda f, k: jax.vmap(f)(jnp.stack([k, 2 * k])),
+}
+
+
+@pytest.mark.parametrize("name", DERIVATIVES)
+def test_derivatives_are_not_traced_again(folder, name):
+    def found(programs):
+        return DERIVATIVES[name](lambda k: loss(programs, "y", jnp.asarray(X), k), jnp.array(K))
+
+    first, traced = found(ProgramCache()), len(TRACES)
+    np.testing.assert_array_equal(found(ProgramCache()), first)
+    assert len(TRACES) == traced
+
+
+def odd(v):
+    return -jnp.sin(-v)
+
+
+def gradient(programs, part):
+    return float(jax.grad(lambda k: loss(programs, part, jnp.asarray(X), k))(K))
+
+
+def by_jax(form, part):
+    def f(k):
+        y = form(k * form(k * X))
+        return jnp.sum((y if part == "y" else 2 * k * y) ** 2)
+
+    return float(jax.grad(f)(K))
+
+
+@pytest.mark.parametrize("later", [jnp.sin, odd])
+def test_another_pullback_of_what_was_found(folder, later):
+    """A later process reads another part of the outcome: its pullback is not there, and needs what tracing alone tells.
+    Where tracing then writes the same function in another way, the arrays of the old program are not used."""
+    gradient(ProgramCache(), "y")
+    FORM[:] = [later]
+    programs, traced = ProgramCache(), len(TRACES)
+    for _ in range(2):
+        assert gradient(programs, "twice") == pytest.approx(by_jax(later, "twice"), rel=1e-13)
+    assert len(TRACES) == traced + (1 if later is jnp.sin else 2)
+
+
+def test_what_was_found_is_optimized_once_that_pays(folder):
+    x, k = jnp.asarray(X), jnp.array(K)
+    first = ProgramCache().call(wave, True, (x, k), {})
+    programs, since = ProgramCache(), len(compilations())
+    programs.call(wave, True, (x, k), {})
+    (called,) = programs._programs.values()
+    program: Any = called.function._program
+    program._spent = 1e6
+    programs.call(wave, True, (x, k), {})
+    for thread in list(tiers._THREADS):
+        thread.join()
+    assert [c.how for c in compilations()[since:]] == ["loaded", "optimized"]
+    np.testing.assert_allclose(programs.call(wave, True, (x, k), {})["y"], first["y"], rtol=1e-15)
+
+
+def test_an_executable_that_is_gone_is_compiled_anew(folder):
+    x, k = jnp.asarray(X), jnp.array(K)
+    first = ProgramCache().call(wave, True, (x, k), {})
+    where: Any = kept.folder()
+    smallest = min(where.iterdir(), key=lambda path: path.stat().st_size)  # the record
+    for path in set(where.iterdir()) - {smallest}:
+        path.unlink()
+    np.testing.assert_array_equal(ProgramCache().call(wave, True, (x, k), {})["y"], first["y"])
+    smallest.write_bytes(b"not a record")
+    np.testing.assert_array_equal(ProgramCache().call(wave, True, (x, k), {})["y"], first["y"])
+
+
+# --- what must not be taken for the same ---------------------------------------------------------------------------
+
+
+class Slow(eqx.Module):
+    rate: float = eqx.field(static=True)
+
+
+def local(rate):
+    class Slow(eqx.Module):
+        rate: float = eqx.field(static=True)
+
+    return Slow(rate)
+
+
+DIFFERENT = {
+    "solvers of one name": (diffrax.Tsit5(), solvers.Tsit5()),
+    "solvers": (solvers.BDF(), solvers.Rodas5P()),
+    "an option": (solvers.BDF(), dataclasses.replace(solvers.BDF(), max_order=2)),
+    "int and float": (1, 1.0),
+    "int and bool": (1, True),
+    "text and bytes": ("a", b"a"),
+    "zeros": (0.0, -0.0),
+    "list and tuple": ([1, 2], (1, 2)),
+    "nesting": ((1, (2,)), ((1, 2),)),
+    "names": ({"a": 1}, {"b": 1}),
+    "arrays": (np.ones(2), np.array([1.0, 1.0 + 1e-15])),
+    "types of arrays": (np.ones(2), np.ones(2, np.float32)),
+    "shapes": (np.ones((1, 2)), np.ones((2, 1))),
+    "functions": (jnp.sin, jnp.cos),
+    "functions of one name": (jnp.sin, np.sin),
+    "structures": (jax.tree.structure((1, None)), jax.tree.structure((1, ()))),
+    "static parts": (jax.tree.structure(eqx.nn.Linear(2, 3, key=jax.random.key(0))),
+                     jax.tree.structure(eqx.nn.Linear(2, 4, key=jax.random.key(0)))),
+    "record and function": (Slow(1.0), jnp.sin),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DIFFERENT)
+def test_what_differs_is_told_apart(name, monkeypatch):
+    monkeypatch.setattr(lasting, "LIBRARIES", (*lasting.LIBRARIES, __name__))
+    one, other = DIFFERENT[name]
+    digests = lasting.lasting(one), lasting.lasting(other)
+    assert None not in digests and digests[0] != digests[1]
+    assert digests == (lasting.lasting(one), lasting.lasting(other))
+
+
+@pytest.mark.parametrize(
+    "part", [lambda x: x, wave, Slow(1.0), local(1.0), [Slow], object(), {1: wave}, np.array([object()])]
+)
+def test_code_of_users_is_not_told(part):
+    """A function, or a class, may be another one in the next process, and so may all that it reads."""
+    assert lasting.lasting(part) is None
+
+
+@pytest.mark.parametrize("name", [name for name, (_, kind) in PAIRS.items() if kind == STRUCTURE])
+def test_models_of_other_structure_are_told_apart(name):
+    """Pairs of models that differ in one argument of a declaration."""
+    digests = [lasting.lasting(jax.tree.structure(built(one))) for one in PAIRS[name][0]]
+    assert digests[0] != digests[1] or digests == [None, None]
+
+
+def test_options_of_jax_and_types_are_told_apart():
+    options = {lasting.lasting(1)}
+    with jax.enable_x64(False):
+        options.add(lasting.lasting(1))
+    with jax.default_matmul_precision("highest"):
+        options.add(lasting.lasting(1))
+    with jax.numpy_dtype_promotion("standard"):
+        options.add(lasting.lasting(1))
+    assert len(options) == 4
+    arrays = jnp.ones(2), jnp.ones(3), jnp.ones(2, jnp.float32), jnp.ones((2, 1))
+    assert len({types_of([a]) for a in arrays}) == 4
+    assert types_of([jnp.asarray(np.ones(()))]) != types_of([jax.jit(lambda: 1.0)()])  # weakly typed
+
+
+PROCESS = """
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+from problems import component
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, NeuralDAEBlock, compilations, der, simulate
+def decay(law=None):
+    def write(c, ev):
+        x = c.variable("x", start=1.0, fixed=True)
+        c.add_equations(der(x) + c.parameter("k", 2.0) * x)
+    diagram, c = AcausalDiagram(), component(write)
+    diagram.add(c)
+    if law is not None:
+        diagram.add_neural_correction_block(NeuralDAEBlock(law, jnp.ones(1), targets=[(c, "x")], name="law"))
+    return AcausalCompiler(c.ev, diagram)()
+def law(t, u, theta):
+    return theta * jnp.FORM(u)
+for system in (decay(), decay(law)):
+    def end(k):
+        return simulate(system.with_parameters({"c.k": k}), 1.0)["c.x"][-1]
+    since = len(compilations())
+    found = float(end(2.0)), float(jax.grad(end)(2.0))
+    made = compilations()[since:]
+    print(*found, sum(c.how == "loaded" for c in made) == len(made), sum(c.traced + c.lowered for c in made) < 0.01)
+"""
+
+
+@pytest.mark.long("two processes that compile a gradient")
+def test_the_next_process_traces_nothing_but_code_of_users(tmp_path, monkeypatch):
+    """The second process finds the model's programs. A user's function of the same name is another one there."""
+    monkeypatch.setenv("JAXONOMY_DAE_CACHE", str(tmp_path))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    first, second = (run(PROCESS.replace("FORM", form)).splitlines() for form in ("sin", "cos"))
+    known, own = (lines[0].split() for lines in (first, second)), (lines[1].split() for lines in (first, second))
+    (*numbers, loaded, traced), (*again, loaded_again, traced_again) = known
+    assert numbers == again and (loaded, traced, loaded_again, traced_again) == ("False", "False", "True", "True")
+    np.testing.assert_allclose([float(v) for v in numbers], [np.exp(-2.0), -np.exp(-2.0)], rtol=1e-5)
+    (of_sin, *_), (of_cos, _, loaded, traced) = own
+    assert abs(float(of_sin) - float(of_cos)) > 1e-2 and (loaded, traced) == ("False", "False")
