@@ -109,7 +109,7 @@ def next_event(
 ) -> Array:
     """The number of the first event of a condition that holds and that would change something, or −1; at the start, of
     those that happen there. Not differentiated."""
-    plan: Any = system.plan.events
+    plan = system.plan.some_events
     table = plan.table
     here = system.holding(q).at(t, inputs)
     value = here.guards(x)
@@ -130,7 +130,7 @@ def after_event(
     system: AcausalSystem, t: Time, inputs: Args, events: RestingEvents, event: Array, x: Array, q: Array, writer: Array
 ) -> tuple[Array, Array, Array]:
     """(x, q, the action that wrote each discrete value or −1) after an event."""
-    plan: Any = system.plan.events
+    plan = system.plan.some_events
     table = plan.table
     values, _ = _written(system, t, inputs, x, q)
     happens = (jnp.asarray(table.event) == event) & ~events.ignored
@@ -150,7 +150,7 @@ def both_sides(
     """Where small deviations make events happen. Returns (the discrete values as they are, and after all events at
     whose levels the point lies, relations being true in one row and false in the other, shape (3, q); for each event,
     whether the point lies at its level, shape (events,)). Not differentiated."""
-    plan: Any = system.plan.events
+    plan = system.plan.some_events
     table = plan.table
     here = system.holding(q).at(t, inputs)
     level = jnp.abs(here.guards(x)) <= guard_rounding(system, here, x)
@@ -168,7 +168,7 @@ def ticked(
     system: AcausalSystem, t: Time, inputs: Args, ticking: Sequence[int], x: Array, q: Array
 ) -> tuple[Array, Array]:
     """(x, q) after the sampled events with these numbers, in order, at one instant."""
-    plan: Any = system.plan.events
+    plan = system.plan.some_events
     table, previous = plan.table, q
     for event in ticking:
         values = system.around_event(t, q, previous, inputs).event_values(x) / jnp.asarray(plan.factor, x.dtype)
@@ -181,7 +181,7 @@ def ticked(
 
 def _written(system: AcausalSystem, t: Time, inputs: Args, x: Array, q: Array) -> tuple[Array, Array]:
     """What all actions would write, and what is there now, in units of the state array, shape (actions,) each."""
-    plan: Any = system.plan.events
+    plan = system.plan.some_events
     values = system.around_event(t, q, q, inputs).event_values(x) / jnp.asarray(plan.factor, x.dtype)
     now = jnp.zeros_like(values)
     if len(x):

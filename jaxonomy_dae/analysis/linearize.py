@@ -100,7 +100,7 @@ def linearize(
 def _smooth(system: AcausalSystem, partials: Partials) -> Partials:
     """The partial derivatives, if the model has the same on both sides of all events that are near."""
     if not is_traced(partials) and not bool(partials.agree):
-        table: Any = system.plan.events
+        table = system.plan.some_events
         texts = dict.fromkeys(table.names[k] for k in np.flatnonzero(np.asarray(partials.near)).tolist())
         raise ModelError(
             f"the point lies where {some([repr(text) for text in texts])} turns, and the model has another derivative "
@@ -115,7 +115,7 @@ def _between_ticks(system: AcausalSystem, partials: Partials) -> Partials:
     depends = jnp.any(jnp.concatenate(blocks) != 0, axis=0)
     if not is_traced(partials) and bool(jnp.any(depends)):
         events: Any = resting_events(system.plan)
-        plan: Any = system.plan.events
+        plan = system.plan.some_events
         place = events.unknown[np.flatnonzero(np.asarray(depends))]
         names = some([repr(system.discretes[k]) for k in place.tolist()])
         rows = events.ticking[np.isin(plan.table.discrete[events.ticking], place)]

@@ -1,6 +1,6 @@
 """The partial derivatives of a model at a point, of which linear models are made."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -81,7 +81,7 @@ def _alike(sides: Array) -> Array:
 
 def _moves(plan: SystemPlan, near: Array) -> Array:
     """Whether one of these events lets states jump, or ends the run."""
-    events: Any = plan.events
+    events = plan.some_events
     moves = events.table.ends
     moves[events.table.event[events.state >= 0]] = True
     return jnp.any(near & moves)

@@ -58,7 +58,7 @@ def sampled_space(system: AcausalSystem, point: Sampled, partials: Partials, coo
     plan, events = system.plan, resting_events(system.plan)
     if events is None or not len(events.ticking):
         raise ModelError("sampled=True is for models with events of clocks, when(self.sampled(T), ...); this has none")
-    plan_of_events: Any = plan.events
+    plan_of_events = plan.some_events
     if plan.n_projected and (plan_of_events.state[events.ticking] >= 0).any():
         raise ModelError(
             "a clock writes states of a model with hidden constraints, which has no linear model from tick to tick yet"
@@ -124,7 +124,7 @@ def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
     - `ModelError` if the periods have no common multiple, or if it takes more than `TICKS` ticks; and inside jit, for
         clocks whose periods or offsets differ and are parameters.
     """
-    plan: Any = system.plan.events
+    plan = system.plan.some_events
     clocks = np.unique(plan.table.event[events.ticking]).tolist()
     known = system.parameters.known
     declared = [plan.table.events[e].clock for e in clocks]

@@ -1,7 +1,7 @@
 """`steady_state`: where all derivatives vanish."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -199,7 +199,7 @@ def _not_found(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, .
 
 
 def _restless(system: AcausalSystem, event: int) -> str:
-    plan: Any = system.plan.events
+    plan = system.plan.some_events
     table = plan.table
     text = table.text[event]
     message = table.events[event].message

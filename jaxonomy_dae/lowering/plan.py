@@ -135,6 +135,12 @@ class SystemPlan:
         return self._identity.digest, self._identity.functions
 
     @property
+    def some_events(self) -> EventPlan:
+        """The plan of events, of a model that has some."""
+        assert self.events is not None
+        return self.events
+
+    @property
     def flat(self) -> FlatModel:
         """The model as flattened."""
         return self.model.flat

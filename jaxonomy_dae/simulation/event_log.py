@@ -65,7 +65,7 @@ class Events:
 
     def __init__(self, log: EventLog, system: AcausalSystem, inputs: Args):
         self._log, self._system, self._inputs = log, system, inputs
-        self._table: Any = system.plan.events
+        self._table = system.plan.some_events
 
     @property
     def ts(self) -> Array:

@@ -1,6 +1,5 @@
 """Why a run of a compiled system failed, in names of the model."""
 
-from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -256,7 +255,7 @@ def _too_many_events(events: Events, max_events: int, t: float) -> str:
 
 def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
     """Says why event number `event` happens, or its relation turns, again and again at t, an instant of that length."""
-    table: Any = solution.system.plan.events
+    table = solution.system.plan.some_events
     if EventFlag.RELATION in table.table.events[event].flags:
         return _sliding(table.table.events[event], t)
     times, which = np.asarray(solution.events.ts), np.asarray(solution.events.which, int)
@@ -289,7 +288,7 @@ def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
 def _clash(solution: Solution, number: int, t: float) -> str:
     """Says which two events contradict each other at t, and in what."""
     system = solution.system
-    plan: Any = system.plan.events
+    plan = system.plan.some_events
     pair = pair_of(number, len(plan) + 1)
     places = [{place for event, place in plan.facts.contested if event == k} for k in pair]
     events = sorted(plan.names[k] for k in pair)

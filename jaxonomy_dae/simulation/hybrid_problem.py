@@ -188,7 +188,7 @@ def problem_for(
     system: AcausalSystem, t0: Time, t1: Time, implicit: bool, watch: Watch | None, tolerance: Tolerance
 ) -> SystemProblem:
     """The problem of a system that has events, to be run from t0 to t1."""
-    events: Any = system.plan.events
+    events = system.plan.some_events
     return SystemProblem(
         system=system,
         watch=watch,
@@ -202,7 +202,7 @@ def problem_for(
 def without_clocked(system: AcausalSystem, q: Array) -> Array:
     """The discrete values with the relations of time as they are before they are known: a run that goes on from another
     one, perhaps with other parameters, looks at the clock instead."""
-    events: Any = system.plan.events
+    events = system.plan.some_events
     table = events.table
     clocked = table.are(EventFlag.RELATION)[table.event] & (table.event < events.n_clocks)
     chosen = np.unique(table.discrete[clocked])
