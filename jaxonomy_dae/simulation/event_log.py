@@ -65,7 +65,7 @@ class Events:
 
     def __init__(self, log: EventLog, system: AcausalSystem, inputs: Args):
         self._log, self._system, self._inputs = log, system, inputs
-        self._table = system.plan.some_events
+        self._table = system.plan.events
 
     @property
     def ts(self) -> Array:
@@ -95,7 +95,8 @@ class Events:
 
     @property
     def terminated(self) -> str | None:
-        messages = [self._table.table.events[k].message for k in self._numbers()]
+        plan = self._system.plan
+        messages = [plan.some_events.table.events[k].message for k in self._numbers()]
         return messages[-1] if messages else None
 
     @property
