@@ -1,6 +1,5 @@
 """Why a run of a compiled system failed, in names of the model."""
 
-
 import diffrax
 import equinox as eqx
 import jax
