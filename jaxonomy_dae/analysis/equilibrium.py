@@ -128,7 +128,7 @@ def find_equilibrium(
         def root_from(start):
             sizes = Sizes(nominal, jnp.maximum(jnp.abs(start), nominal), zero, zero)
             look = looking(function, lambda w: magnitude(w, base))
-            found = jax.lax.stop_gradient(find_root(look, m, start, sizes, core, None, bounds, typical))
+            found = jax.lax.stop_gradient(find_root(look, m, start, sizes, core, bounds=bounds, typical=typical))
             return Root(found.x, found.jacobian, found.limit, found.unit, found.method < FAILED)
 
         if events is None or m > k:

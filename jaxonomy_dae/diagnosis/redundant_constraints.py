@@ -17,6 +17,7 @@ import collections
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -42,7 +43,9 @@ from ..model.typical_sizes import typical_sizes
 from ..tolerances import HALF_OF_THE_DIGITS, KNOWN, NO_PART, UNCHANGED
 from .wording import listed, words
 
-LARGEST = 600  # constraints whose singular values are computed, in some 0.2 s
+# Constraints whose singular values are computed, in some 0.2 s. Of more, the combinations that vanish are what least
+# squares leave of random ones.
+LARGEST = 600
 WHOLE = LARGEST  # constraints of a part in which those that depend on each other are not sought first
 SAMPLES = 4  # random directions of a larger part that stand for all: what none of them sees has probability zero
 NO_SHARE = 1e-4  # of the largest, in a random vector for which uᵀG is zero to some six digits: no part of any such u
@@ -117,28 +120,30 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
     if len(np.unique(c[rows])) > 1:
         return []  # constraints of several orders: their Jacobian is no derivative by one set of quantities
     position = quantities.first[columns] + quantities.highest[columns] - c[rows[0]]
-    free = None
+    sampled = None
     if len(rows) > WHOLE:
-        rows, free = _dependent_rows(at, entries, rows, columns)
+        rows, sampled = _sampled(at, entries, rows, columns)
         entries = entries.take(np.isin(entries.row, rows))
-        if not 0 < len(rows) <= LARGEST:
+        if not len(rows):
             return []
     place = (np.searchsorted(rows, entries.row), np.searchsorted(columns, entries.column))
 
-    def matrix_of(numbers: np.ndarray) -> np.ndarray:
-        dense = np.zeros((len(rows), len(columns)))
-        np.add.at(dense, place, numbers)
-        return dense
+    def matrix_of(numbers: np.ndarray) -> sp.csr_array:
+        return sp.csr_array((numbers, place), shape=(len(rows), len(columns)))
 
     where = at.model.groups, at.model.extended, entries, at.point
     matrix, bounds = map(matrix_of, _values_and_errors(at, entries))
-    if not np.isfinite(matrix).all():
+    if not np.isfinite(matrix.data).all():
         return []
-    rank = rank_of(matrix, bounds)
-    row_scale, column_scale = rank.r, rank.c
-    # Where it is constant, no point that is found decides.
-    number = rank.number if entries.constant.all() else int((rank.s > HALF_OF_THE_DIGITS * rank.s[0]).sum())
-    left, right = rank.u[:, number:], rank.vt[number:].T if free is None else free / column_scale[:, None]
+    if sampled is None or len(rows) <= LARGEST:
+        rank = rank_of(matrix.toarray(), bounds.toarray())
+        # Where it is constant, no point that is found decides.
+        number = rank.number if entries.constant.all() else int((rank.s > HALF_OF_THE_DIGITS * rank.s[0]).sum())
+        row_scale, column_scale, left, right = rank.r, rank.c, rank.u[:, number:], rank.vt[number:].T
+        right = right if sampled is None else sampled.right / column_scale[:, None]
+    else:
+        row_scale, column_scale, left = sampled.row_scale, sampled.column_scale, sampled.left
+        right = sampled.right / column_scale[:, None]
     matrix = above_errors(matrix, bounds)  # sin(1e-17) is zero
     if not left.shape[1]:
         return []
@@ -147,11 +152,11 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
     for k in range(right.shape[1]):
         move = np.zeros(at.model.extended.quantities.n)
         move[position] = column_scale * right[:, k]
-        slope = row_scale[:, None] * matrix_of(evaluate_along(*where, move)) * column_scale
-        if not np.isfinite(slope).all():
+        slope: Any = sp.diags_array(row_scale) @ matrix_of(evaluate_along(*where, move)) @ sp.diags_array(column_scale)
+        if not np.isfinite(slope.data).all():
             return []
-        changed[:, k] = left.T @ slope @ right
-        size[:, k] = np.abs(left.T) @ np.abs(slope) @ np.abs(right)
+        changed[:, k] = left.T @ (slope @ right)
+        size[:, k] = np.abs(left.T) @ (abs(slope) @ np.abs(right))
     kept, still = _unchanged(changed.reshape(len(changed), -1), float(size.max(initial=0.0)))
     found = []
     for basis, is_redundant in ((left @ still, True), (left @ kept, False)):
@@ -171,26 +176,44 @@ def _values_and_errors(at: ModelAt, entries: ConstraintEntries) -> tuple[np.ndar
     return evaluate(*where), evaluate_errors(*where, known)
 
 
-def _dependent_rows(
+class _Sampled(NamedTuple):
+    """The scales of rows and columns of a Jacobian G, a basis of the combinations u with uᵀG = 0, shape (rows, k), and
+    random directions v with Gv = 0, shape (columns, samples); u in scaled rows, v in the units of the columns."""
+
+    row_scale: np.ndarray
+    column_scale: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+
+
+def _sampled(
     at: ModelAt, entries: ConstraintEntries, rows: np.ndarray, columns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Of a large part: the constraints that some combination u with uᵀG = 0 contains, and directions v with Gv = 0,
-    shape (columns, samples). Both are what least squares leave of random vectors."""
+) -> tuple[np.ndarray, _Sampled]:
+    """Of a large part: the constraints that some combination u with uᵀG = 0 contains, and these combinations. They are
+    what least squares leave of random vectors: as many as it takes until one more of them tells nothing new."""
     place = (np.searchsorted(rows, entries.row), np.searchsorted(columns, entries.column))
     shape = len(rows), len(columns)
     values, errors = (sp.csr_array((v, place), shape=shape) for v in _values_and_errors(at, entries))
     jacobian = sp.csr_array(above_errors(values, errors))
     if not np.isfinite(jacobian.data).all():
-        return rows[:0], np.zeros((len(columns), 0))
-    scaled, _, unit = equilibrated(jacobian)
-    forwards, backwards, rng = SparseLeastSquares(scaled), SparseLeastSquares(scaled.T), np.random.default_rng(0)
-    shares = np.zeros(len(rows))
-    free = np.zeros((len(columns), SAMPLES))
-    for k in range(SAMPLES):
-        u, v = rng.normal(size=len(rows)), rng.normal(size=len(columns))
-        shares = np.maximum(shares, np.abs(u - scaled @ forwards.solve(u)))
-        free[:, k] = unit * (v - scaled.T @ backwards.solve(v))
-    return rows[shares > NO_SHARE], free
+        return rows[:0], _Sampled(*(np.zeros((0, 0)),) * 4)
+    scaled, row_scale, unit = equilibrated(jacobian)
+    rng = np.random.default_rng(0)
+
+    def left_of(matrix: Any, count: int) -> np.ndarray:
+        solver, left = SparseLeastSquares(matrix), rng.normal(size=(matrix.shape[0], count))
+        for _ in range(2):  # the first time to some six digits
+            left = left - np.stack([matrix @ solver.solve(u) for u in left.T], axis=1)
+        return left
+
+    left, count = left_of(scaled, SAMPLES), SAMPLES
+    while (number := int((np.linalg.svd(left, compute_uv=False) > NO_SHARE).sum())) == count < shape[0]:
+        count *= 2
+        left = left_of(scaled, count)
+    right = unit[:, None] * left_of(scaled.T, SAMPLES)
+    kept = np.abs(left).max(axis=1) > NO_SHARE
+    basis = np.linalg.svd(left[kept], full_matrices=False)[0][:, :number]
+    return rows[kept], _Sampled(row_scale[kept], unit, basis, right)
 
 
 def _unchanged(changed: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
@@ -201,12 +224,12 @@ def _unchanged(changed: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray
     return u[:, ~zero], u[:, zero]
 
 
-def _connected(basis: np.ndarray, matrix: np.ndarray) -> list[np.ndarray]:
+def _connected(basis: np.ndarray, matrix: Any) -> list[np.ndarray]:
     """The rows of a basis that are not zero, in sets that share no column of the matrix."""
     support = np.flatnonzero(np.abs(basis).max(axis=1, initial=0.0) > NO_PART)
     if not len(support):
         return []
-    row, column = np.nonzero(matrix[support])
+    row, column = matrix[support].nonzero()
     n, m = len(support), matrix.shape[1]
     graph = sp.coo_array((np.ones(len(row)), (row, n + column)), shape=(n + m, n + m))
     _, label = connected_components(graph, directed=False)

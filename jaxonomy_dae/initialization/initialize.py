@@ -79,7 +79,10 @@ def initialize(
         x0, nothing = problem.x0, jnp.zeros((), jnp.int32)
         value = problem.starts(problem.point, x0)
         limit = solved(dtype) * (jnp.abs(value) + problem.data)
-        return InitialPoint(x0, x0[:0], value - problem.target, limit, problem.target, nothing, nothing, None)
+        return InitialPoint(
+            x=x0, solved=x0[:0], residual=value - problem.target, limit=limit, target=problem.target,
+            method=nothing, evaluations=nothing, jacobian=None,
+        )  # fmt: skip
     sparse = None if len(solve_for) or solver is not None else sparse_rows(plan, rows)
     if sparse is not None:
         return _large_point(problem, sparse)
@@ -110,7 +113,10 @@ def initialize(
         kept = jnp.abs(jax.lax.stop_gradient(remaining - jacobian @ step)) <= limit / solved(dtype) ** 0.5
         w = jnp.where(good & jnp.any(held & ~kept), jnp.nan, w)
     n = plan.n_state
-    return InitialPoint(w[:n], w[n:], remaining, limit, problem.full, root.method, root.evaluations, root.jacobian)
+    return InitialPoint(
+        x=w[:n], solved=w[n:], residual=remaining, limit=limit, target=problem.full,
+        method=root.method, evaluations=root.evaluations, jacobian=root.jacobian,
+    )  # fmt: skip
 
 
 def _searched(problem: InitialProblem, solver: Any) -> Found:
@@ -128,7 +134,16 @@ def _searched(problem: InitialProblem, solver: Any) -> Found:
     if solver is not None:
         square = core is not None or not rows.n_soft
         return find_root_with(solver, problem.function, start, sizes, problem.is_soft, square, problem.magnitude)
-    found = find_root(problem.look, problem.m, start, sizes, core, problem.is_soft, problem.bounds, problem.typical)
+    found = find_root(
+        problem.look,
+        problem.m,
+        start,
+        sizes,
+        core,
+        soft=problem.is_soft,
+        bounds=problem.bounds,
+        typical=problem.typical,
+    )
     if staged is None:
         return found
     moved = jnp.any(start != problem.start)
@@ -204,7 +219,7 @@ def search_outside(
     soft = np.arange(m) >= m - rows.n_soft
     core, bounds = independent_rows(plan, rows, n), bounds_of(plan, len(unknown))
     with np.errstate(all="ignore"):  # what is not finite is a rung's failure, as in a program
-        root = find_root(look, m, first.w, first.sizes, core, soft, bounds, first.typical)
+        root = find_root(look, m, first.w, first.sizes, core, soft=soft, bounds=bounds, typical=first.typical)
     return jax.tree.map(on_device, root)
 
 
@@ -276,7 +291,10 @@ def _large_point(problem: InitialProblem, sparse: SparseRows) -> InitialPoint:
         all_hold = jnp.all(jnp.abs(frozen(remaining)) <= limit)
         w, remaining = jax.lax.cond(all_hold, lambda: (w, remaining), some_cannot)
     limit = jnp.where(problem.is_soft, jnp.inf, limit)
-    return InitialPoint(w, w[:0], remaining, limit, problem.full, method, evaluations, None)
+    return InitialPoint(
+        x=w, solved=w[:0], residual=remaining, limit=limit, target=problem.full,
+        method=method, evaluations=evaluations, jacobian=None,
+    )  # fmt: skip
 
 
 def _nearest_point(problem: InitialProblem, w, jacobian, unit, good) -> tuple[Any, Any]:

@@ -140,7 +140,10 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
                 again.append(k)
             held.add(r.quantity)
         independent = tuple(k not in again for k in range(len(rows)))
-        return InitialRows(guess, tuple(rows), 0, independent, True, tuple(again), (), ())
+        return InitialRows(
+            guess=guess, kept=tuple(rows), n_soft=0, independent=independent, direct=True, redundant=tuple(again),
+            settled=(), dropped=(),
+        )  # fmt: skip
     generic = _generic(plan, solve_for)
     ranked = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
     return ranked(plan, generic, overrides, fixed, guess, _ranks(plan, guess, others) if ranks is None else ranks)
@@ -415,7 +418,10 @@ def _weights_of(rank: Any, gradients: Any, n_equations: int) -> np.ndarray:
 def _chosen(guess, kept: list[StartRow], independent: list[bool], soft, redundant, settled, dropped) -> InitialRows:
     alone = (*independent, *(closes for _, closes in soft))
     rows = (*kept, *(row for row, _ in soft))
-    return InitialRows(guess, rows, len(soft), alone, False, redundant, settled, tuple(dropped))
+    return InitialRows(
+        guess=guess, kept=rows, n_soft=len(soft), independent=alone, direct=False, redundant=redundant,
+        settled=settled, dropped=tuple(dropped),
+    )  # fmt: skip
 
 
 # --- what follows from what ----------------------------------------------------------------------------------------

@@ -189,14 +189,14 @@ def _finding(plan: SystemPlan, known: Known, block: Block, rank: Rank | SparseRa
     singular, n = not rank.is_regular, len(names)
     undecided = singular and n <= DENSE_LIMIT and is_undecided(block.jacobian(known).toarray())
     return BlockFinding(
-        rank.condition if rank.is_regular else np.inf,
-        singular,
-        n,
-        tuple(variables) or tuple(names),
-        tuple(dict.fromkeys(equations or texts)),
-        causes,
-        bool(causes) and causes[0][0] in plan.flat.parameters.names,
-        undecided,
+        condition=rank.condition if rank.is_regular else np.inf,
+        singular=singular,
+        size=n,
+        variables=tuple(variables) or tuple(names),
+        equations=tuple(dict.fromkeys(equations or texts)),
+        causes=causes,
+        causes_are_parameters=bool(causes) and causes[0][0] in plan.flat.parameters.names,
+        undecided=undecided,
     )
 
 
@@ -235,12 +235,12 @@ def _constraints(plan: SystemPlan, known: Known) -> Iterator[BlockFinding]:
     at = [(plan.quantity_name[q], float(values[q])) for q in plan.states[states].tolist()]
     names, singular = tuple(name for name, _ in at), not rank.is_regular
     yield BlockFinding(
-        rank.condition if rank.is_regular else np.inf,
-        singular,
-        m,
-        names,
-        tuple(plan.locate(int(texts[e])) for e in dependent),
-        tuple(at),
-        False,
-        singular and is_undecided(matrix),
+        condition=rank.condition if rank.is_regular else np.inf,
+        singular=singular,
+        size=m,
+        variables=names,
+        equations=tuple(plan.locate(int(texts[e])) for e in dependent),
+        causes=tuple(at),
+        causes_are_parameters=False,
+        undecided=singular and is_undecided(matrix),
     )
