@@ -234,6 +234,26 @@ class SystemPlan:
             self._programs[key] = plan(steps, self.states, inputs, n, self.carried, self.linear_solver)
         return self._programs[key]
 
+    def width(self, quantities: np.ndarray) -> int:
+        """The number of values that `reading` these quantities has at hand, states and inputs included."""
+        return int((self.reading(quantities).layout.chunk >= 0).sum())
+
+    def owners(self, quantities: np.ndarray) -> tuple[int, ...]:
+        """The numbers of the steps that compute these quantities; −1 stands for states, inputs and zero."""
+        return tuple(distinct(self._owner[quantities[quantities != ZERO]]).tolist()) or (-1,)
+
+    def owned(self, owners: Sequence[int]) -> np.ndarray:
+        """All quantities that have these `owners`, ascending."""
+        return np.flatnonzero(np.isin(self._owner, owners))
+
+    @functools.cached_property
+    def _owner(self) -> np.ndarray:
+        owner = np.full(self.extended.quantities.n, -1)
+        for k, step in enumerate(self.steps):
+            for quantities in step.unknown:
+                owner[quantities] = k
+        return owner
+
     @functools.cached_property
     def _programs(self) -> dict[bytes, Program]:
         return {}

@@ -163,8 +163,21 @@ class Solution(eqx.Module):
             return self._where_reached(_observed(*given, quantity, factor))[:, 0]
         if not is_traced(given):
             return picked(self._known_columns((name,), {}, quantity, factor, None), (slice(None), 0))
-        values, _ = _chosen(*given, on_device(quantity), on_device(factor, self.states.dtype))
+        values, _ = self._evaluated(given[1], given[2], given[4], quantity, factor)
         return self._where_reached(values)[:, 0]
+
+    def _evaluated(
+        self, ts: Numeric, states: Numeric, discrete: Numeric, quantity: np.ndarray, factor: np.ndarray
+    ) -> tuple[Any, Any]:
+        """The values of quantities at times, shape (times, at least len(quantity)), and those of all quantities at
+        `_some` times where they are looked at. Numbers of names, and names of one step of a large model, share a
+        program."""
+        plan, n = self.system.plan, 1 << (len(quantity) - 1).bit_length()
+        few = fit(ts.shape[0], plan.extended.quantities.n) or is_looked_at(self.system)
+        owners = None if few else plan.owners(quantity)
+        place = quantity if owners is None else np.searchsorted(plan.owned(owners), quantity)
+        padded = on_device(np.resize(place, n)), on_device(np.resize(factor, n), self.states.dtype)
+        return _chosen(self.system, ts, states, self.inputs, discrete, *padded, owners)
 
     def _where_reached(self, values: Numeric) -> Numeric:
         """The values, shape (n, k), with not-a-number where they are not finite, and in rows that the run did not
@@ -230,9 +243,7 @@ class Solution(eqx.Module):
         elif is_staged(given):
             values = _observed(*given, quantity, factor)
         else:
-            n = 1 << (len(quantity) - 1).bit_length()  # numbers of names that share a program
-            padded = np.resize(quantity, n), np.resize(factor, n)
-            chosen, _ = _chosen(*given, jnp.asarray(padded[0]), jnp.asarray(padded[1], self.states.dtype))
+            chosen, _ = self._evaluated(self.ts, self.states, self.discrete, quantity, factor)
             values = jnp.where(quantity < 0, 0.0, chosen[:, : len(quantity)])
         values = self._where_reached(values)
         if not own:
@@ -251,10 +262,8 @@ class Solution(eqx.Module):
         if inside is not None:
             values = np.asarray(self.states)[:, inside] * factor.astype(values.dtype)
         elif (quantity >= 0).any():
-            n = 1 << (len(quantity) - 1).bit_length()  # numbers of names that share a program
             ts, states, discrete = filled_up((self.ts, self.states, self.discrete))
-            padded = on_device(np.resize(quantity, n)), on_device(np.resize(factor, n), values.dtype)
-            chosen, some = _chosen(self.system, ts, states, self.inputs, discrete, *padded)
+            chosen, some = self._evaluated(ts, states, discrete, quantity, factor)
             values = np.asarray(chosen)[: len(self.ts), : len(quantity)]
             self._look_at(read, quantity, factor, np.where(quantity < 0, 0.0, values), some)
         values = np.where(quantity < 0, 0.0, values)
@@ -416,26 +425,30 @@ def _observed(system: AcausalSystem, ts, states, inputs, discrete, quantity: np.
     def one(t, x, q):
         return _held(system, q).at(t, inputs).quantities(x, read, factor)
 
-    values = at_times(one, ts, states, discrete, width=system.plan.extended.quantities.n)
+    values = at_times(one, ts, states, discrete, width=system.plan.width(read))
     return jnp.where(quantity < 0, 0.0, values)
 
 
 @compiled
 @precisely
-def _chosen(system: AcausalSystem, ts, states, inputs, discrete, quantity, factor):
-    """The values of quantities, shape (n, quantities), and those of all quantities at `_some` times. Their numbers are
-    traced, so that one program serves as many names whichever they are; all quantities are computed, at a block of
-    times after another."""
-    every = np.arange(system.plan.extended.quantities.n)
+def _chosen(system: AcausalSystem, ts, states, inputs, discrete, place, factor, owners: tuple[int, ...] | None):
+    """The values of quantities, shape (n, quantities), and those of all quantities at `_some` times. Which they are is
+    traced: their places among all quantities, or among those that `owners` compute, so that one program serves as many
+    names whichever they are. With `owners`, only what they need is computed, and the values at `_some` times are
+    None."""
+    plan = system.plan
+    every = np.arange(plan.extended.quantities.n) if owners is None else plan.owned(owners)
 
     def all_at(t, x, q):
         return _held(system, q).at(t, inputs).quantities(x, every, np.ones(len(every)))
 
     rows, some = (ts, states, discrete), _some(ts.shape[0])
-    if fit(ts.shape[0], len(every)):
+    if owners is None and fit(ts.shape[0], len(every)):
         found = jax.vmap(all_at)(*rows)
-        return factor * found[:, quantity], found[some]
-    values = at_times(lambda *row: factor * all_at(*row)[quantity], *rows, width=len(every))
+        return factor * found[:, place], found[some]
+    values = at_times(lambda *row: factor * all_at(*row)[place], *rows, width=plan.width(every))
+    if owners is not None:
+        return values, None
     return values, jax.vmap(all_at)(*jax.tree.map(lambda row: row[some], rows))
 
 
