@@ -62,79 +62,103 @@ def unknowns(plan: SystemPlan, drifting: tuple[int, ...]) -> np.ndarray:
     return np.setdiff1d(np.arange(plan.n_state), drifting)
 
 
-def find_equilibrium(
-    system: AcausalSystem, t: Time, x0: Array, inputs: Args, drifting: tuple[int, ...], kept: tuple[int, ...] = ()
-) -> Equilibrium:
-    """Searches from `x0`; a pure function, to be used inside jit. `drifting` are the places of states, `kept` those of
-    discrete values, that stay as they are."""
-    plan = system.plan
-    free = unknowns(plan, drifting)
-    events = resting_events(plan, kept, drifting)
-    solved_for = np.zeros(0, np.int64) if events is None else events.unknown
-    n = len(free)
-    x0 = jax.lax.stop_gradient(x0)
+class _Rows:
+    """The rows of an equilibrium at a frozen time, as functions of the unknowns w: the entries `free` of the state
+    array, and the discrete values `solved_for`. `given` are system, time and inputs, `still` the same, not
+    differentiated."""
 
-    def parts(w, base: Point):
-        return base.x.at[free].set(w[:n]), base.q.at[solved_for].set(w[n:]) if len(solved_for) else base.q
+    def __init__(
+        self, given: tuple[AcausalSystem, Time, Args], x0: Array, drifting: tuple[int, ...], kept: tuple[int, ...]
+    ):
+        system, t, inputs = given
+        self.plan = plan = system.plan
+        self.given, self.still = given, (frozen_inputs(system), frozen_inputs(t), frozen_inputs(inputs))
+        self.free, self.events = unknowns(plan, drifting), resting_events(plan, kept, drifting)
+        self.solved_for = np.zeros(0, np.int64) if self.events is None else self.events.unknown
+        sizes = jax.lax.stop_gradient(system.typical_sizes[plan.states])
+        self.slowest = jnp.append(AT_REST * sizes, jnp.zeros(len(plan.carried), sizes.dtype))
+        self.everywhere = np.concatenate([plan.states, plan.carried]).astype(np.int64)
+        self.scale = jnp.asarray(declared_scale(plan.model)[self.everywhere], x0.dtype)
+        q0 = self.still[0].discrete_values.astype(x0.dtype)
+        self.begin = Point(x0, q0, jnp.full(q0.shape, -1), jnp.zeros(q0.shape, bool))
+        self.k = len(self.free) + len(self.solved_for)
+        self.m = jax.eval_shape(lambda: self.residual(self.start(self.begin), self.begin, *self.still)).shape[0]
 
-    sizes = jax.lax.stop_gradient(system.typical_sizes[plan.states])
-    slowest = jnp.append(AT_REST * sizes, jnp.zeros(len(plan.carried), sizes.dtype))
+    def start(self, base: Point) -> Array:
+        """The unknowns of a point."""
+        return jnp.append(base.x[self.free], base.q[self.solved_for])
 
-    def residual(w, base: Point, system, t, inputs):
-        x, q = parts(w, base)
+    def parts(self, w: Array, base: Point) -> tuple[Array, Array]:
+        """The state array and the discrete values; those that are not solved for are as in `base`."""
+        n = len(self.free)
+        q = base.q.at[self.solved_for].set(w[n:]) if len(self.solved_for) else base.q
+        return base.x.at[self.free].set(w[:n]), q
+
+    def residual(self, w: Array, base: Point, system: AcausalSystem, t: Time, inputs: Args) -> Array:
+        """The slopes, the residuals of nonlinear blocks and the hidden constraints, and what ticks would change."""
+        x, q = self.parts(w, base)
         here = system.holding(q).at(t, inputs)
         slopes = here.semi_explicit(x)
-        creeping = jnp.abs(slopes) <= slowest
+        creeping = jnp.abs(slopes) <= self.slowest
         slopes = slopes - jax.lax.stop_gradient(jnp.where(creeping, slopes, 0))
-        rows = [slopes[free], here.projected_onto(x)]
-        if events is not None and len(events.ticking):
-            rows.append(left_by_ticks(system, t, inputs, events, x, q))
+        rows = [slopes[self.free], here.projected_onto(x)]
+        if self.events is not None and len(self.events.ticking):
+            rows.append(left_by_ticks(system, t, inputs, self.events, x, q))
         return jnp.concatenate(rows)
 
-    frozen = still, still_t, still_inputs = tuple(frozen_inputs(given) for given in (system, t, inputs))
-    everywhere = np.concatenate([plan.states, plan.carried]).astype(np.int64)
-    scale = jnp.asarray(declared_scale(plan.model)[everywhere], x0.dtype)
-    q0 = still.discrete_values.astype(x0.dtype)
-    begin = Point(x0, q0, jnp.full(q0.shape, -1), jnp.zeros(q0.shape, bool))
-    m = jax.eval_shape(lambda: residual(jnp.append(x0[free], q0[solved_for]), begin, *frozen)).shape[0]
+    def followed(self, w: Array, base: Point, system: AcausalSystem, t: Time, inputs: Args) -> Array:
+        """The residual where discrete values that events compute follow the unknowns."""
+        if self.events is not None and len(self.events.computed):
+            base = base._replace(q=self.computed(w, base, system, t, inputs))
+        return self.residual(w, base, system, t, inputs)
 
-    def magnitude(w, base: Point):
-        x, q = parts(w, base)
-        here, reach = still.holding(q).at(still_t, still_inputs), jnp.maximum(jnp.abs(x), scale)
+    def computed(self, w: Array, base: Point, system: AcausalSystem, t: Time, inputs: Args) -> Array:
+        """The discrete values, those included that events compute."""
+        x, q = self.parts(w, base)
+        if self.events is None or not len(self.events.computed):
+            return q
+        return recomputed(system, t, inputs, self.events, x, q, base.writer)
+
+    def magnitude(self, w: Array, base: Point) -> Array:
+        """How large the terms of each row are."""
+        (system, t, inputs), (x, q) = self.still, self.parts(w, base)
+        here, reach = system.holding(q).at(t, inputs), jnp.maximum(jnp.abs(x), self.scale)
         slopes = here.slope_magnitudes(x, reach)
-        rows = [slopes, here.carried_magnitudes(x, reach)] if len(plan.carried) else [slopes]
-        known = jnp.concatenate([jnp.concatenate(rows)[free], here.constraint_magnitudes(x, reach)])
-        return jnp.append(known, jnp.full((m - len(known),), jnp.nan, x.dtype))  # slopes stand for the others
+        rows = [slopes, here.carried_magnitudes(x, reach)] if len(self.plan.carried) else [slopes]
+        known = jnp.concatenate([jnp.concatenate(rows)[self.free], here.constraint_magnitudes(x, reach)])
+        return jnp.append(known, jnp.full((self.m - len(known),), jnp.nan, x.dtype))  # slopes stand for the others
 
-    k = n + len(solved_for)
-    # With more rows than unknowns there is no square system for the homotopy to follow.
-    core = np.arange(m) if m == k else None
-    bounds = np.concatenate([quantity_bounds(plan.model)[everywhere[free]], np.full((k - n, 2), [-np.inf, np.inf])])
-    typical = jnp.append(still.typical_sizes[everywhere[free]], jnp.ones((k - n,), x0.dtype))
-
-    def search(base: Point) -> tuple[Point, Root]:
-        """The equilibrium of the equations with these modes."""
-        start = jnp.append(base.x[free], base.q[solved_for])
-        if not k:
-            rest = residual(start, base, *frozen)
-            none = jnp.zeros((m, 0), x0.dtype)
+    def search(self, base: Point) -> tuple[Point, Root]:
+        """The equilibrium of the equations with the modes of a point."""
+        start, dtype = self.start(base), base.x.dtype
+        if not self.k:
+            rest = self.residual(start, base, *self.still)
+            none = jnp.zeros((self.m, 0), dtype)
             return base, Root(start, none, jnp.zeros_like(rest), start, jnp.all(rest == 0))
-        zero = jnp.zeros((m,), x0.dtype)
-        nominal = jnp.append(scale[free], jnp.zeros((k - n,), x0.dtype))
+        more = np.zeros(self.k - len(self.free))
+        everywhere = self.everywhere[self.free]
+        nominal = jnp.append(self.scale[self.free], jnp.asarray(more, dtype))
+        typical = jnp.append(self.still[0].typical_sizes[everywhere], jnp.asarray(more + 1, dtype))
+        open_ = np.tile([-np.inf, np.inf], (len(more), 1))
+        bounds = np.concatenate([quantity_bounds(self.plan.model)[everywhere], open_])
+        # With more rows than unknowns there is no square system for the homotopy to follow.
+        core = np.arange(self.m) if self.m == self.k else None
 
-        def function(w):
-            return residual(w, base, *frozen)
+        def function(w: Array) -> Array:
+            return self.residual(w, base, *self.still)
 
-        def root_from(start):
+        def root_from(start: Array) -> Root:
+            zero = jnp.zeros((self.m,), dtype)
             sizes = Sizes(nominal, jnp.maximum(jnp.abs(start), nominal), zero, zero)
-            look = looking(function, lambda w: magnitude(w, base))
-            found = jax.lax.stop_gradient(find_root(look, m, start, sizes, core, bounds=bounds, typical=typical))
-            return Root(found.x, found.jacobian, found.limit, found.unit, found.method < FAILED)
+            look = looking(function, lambda w: self.magnitude(w, base))
+            found = jax.lax.stop_gradient(find_root(look, self.m, start, sizes, core, bounds=bounds, typical=typical))
+            parts = found.x, found.jacobian, found.limit, found.unit, found.method < FAILED
+            return Root(*map(jnp.asarray, parts))
 
-        if events is None or m > k:
+        if self.events is None or self.m > self.k:
             root = root_from(start)
         else:  # relations may hold slopes constant, and no step of a search for a root leads on
-            mass = jnp.append(jnp.asarray(system.mass[free], x0.dtype), jnp.ones((k - n,), x0.dtype))
+            mass = jnp.append(jnp.asarray(self.given[0].mass[self.free], dtype), jnp.asarray(more + 1, dtype))
 
             def again(carry: tuple[Array, Root]) -> tuple[Array, Root]:
                 count, _ = carry
@@ -144,44 +168,53 @@ def find_equilibrium(
             shape = jax.eval_shape(root_from, start)
             none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shape)
             _, root = jax.lax.while_loop(lambda c: (c[0] < 2) & ~c[1].good, again, (jnp.array(0), none))
-        x, q = parts(root.w, base)
+        x, q = self.parts(root.w, base)
         return base._replace(x=x, q=q), root
 
-    if events is None or not events.acting.any():
-        base, root = search(begin)
-        event = jnp.array(-1)
-    else:
-        base, root, event = settle(still, still_t, still_inputs, events, begin, search)
-    # Discrete values that no event has written follow the starts, and so do their derivatives.
-    base = base._replace(q=jnp.where(base.changed, base.q, system.discrete_values))
-    w, matrix = root.w, root.jacobian
-
-    def rows(w, base: Point, system, t, inputs):
-        if events is not None and len(events.computed):
-            x, q = parts(w, base)
-            base = base._replace(q=recomputed(system, t, inputs, events, x, q, base.writer))
-        return residual(w, base, system, t, inputs)
-
-    if events is not None and len(events.computed):
-        matrix = jax.lax.stop_gradient(jax.jacfwd(lambda w: rows(w, base, *frozen))(w))
-    if k:
+    def sharpened(self, root: Root, base: Point) -> tuple[Array, Array]:
+        """(The unknowns after the two steps that carry derivatives, the rows there)."""
+        if not self.k:
+            return root.w, self.followed(root.w, base, *self.given)
+        matrix = root.jacobian
+        if self.events is not None and len(self.events.computed):
+            matrix = jax.lax.stop_gradient(jax.jacfwd(lambda w: self.followed(w, base, *self.still))(root.w))
         # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
-        matrix = jnp.where(root.good, matrix * root.unit[None, :], jnp.asarray(np.eye(m, k), x0.dtype))
+        idle = jnp.asarray(np.eye(self.m, self.k), matrix.dtype)
+        matrix = jnp.where(root.good, matrix * root.unit[None, :], idle)
 
-        def correct(w, _):
-            remaining = rows(w, base, system, t, inputs)
+        def correct(w: Array, _: None) -> tuple[Array, Array]:
+            remaining = self.followed(w, base, *self.given)
             return w - root.unit * least_squares(matrix, jnp.where(root.good, remaining, 0)), remaining
 
-        w, remaining = jax.lax.scan(correct, w, length=2)
-        remaining = remaining[-1]
+        w, remaining = jax.lax.scan(correct, root.w, length=2)
+        return w, remaining[-1]
+
+
+def find_equilibrium(
+    system: AcausalSystem, t: Time, x0: Array, inputs: Args, drifting: tuple[int, ...], kept: tuple[int, ...] = ()
+) -> Equilibrium:
+    """Searches from `x0`; a pure function, to be used inside jit. `drifting` are the places of states, `kept` those of
+    discrete values, that stay as they are."""
+    given = system, t, inputs
+    rows = _Rows(given, jax.lax.stop_gradient(x0), drifting, kept)
+    if rows.events is None or not rows.events.acting.any():
+        base, root = rows.search(rows.begin)
+        event = jnp.array(-1)
     else:
-        remaining = rows(w, base, system, t, inputs)
+        base, root, event = settle(*rows.still, rows.events, rows.begin, rows.search)
+    # Discrete values that no event has written follow the starts, and so do their derivatives.
+    base = base._replace(q=jnp.where(base.changed, base.q, system.discrete_values))
+    w, remaining = rows.sharpened(root, base)
     holds = root.good & (event < 0) & jnp.all(jnp.abs(remaining) <= root.limit) & jnp.all(jnp.isfinite(w))
-    x, q = parts(w, base)
-    if events is not None and len(events.computed):
-        q = recomputed(system, t, inputs, events, x, q, base.writer)
     return Equilibrium(
-        x=x, q=q, residual=remaining, limit=root.limit, jacobian=root.jacobian, unit=root.unit, event=event, holds=holds
+        x=rows.parts(w, base)[0],
+        q=rows.computed(w, base, *given),
+        residual=remaining,
+        limit=root.limit,
+        jacobian=root.jacobian,
+        unit=root.unit,
+        event=event,
+        holds=holds,
     )
 
 

@@ -69,11 +69,12 @@ class Found(NamedTuple):
 
 
 def looking(
-    function: Callable[[Numbers], Numbers], magnitude: Callable[[Numbers], Numbers] | None = None
+    function: Callable[[jax.Array], jax.Array], magnitude: Callable[[jax.Array], jax.Array] | None = None
 ) -> Callable[[Numbers], Look]:
     """The rows at a point, from the function F and that of the magnitudes of its terms."""
 
     def look(x: Numbers) -> Look:
+        x = jnp.asarray(x)
         jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(x)
         # What functions of the user's close over may be differentiated elsewhere: not in here.
         return jax.lax.stop_gradient(Look(value, jacobian, None if magnitude is None else magnitude(x)))
