@@ -214,7 +214,11 @@ class _Writer:
             if member.source.literals and len(rest) == 1:
                 return Reference((self.write(member), *rest), ((), ()))
             return Reference(e.parts, subscripts)
-        out = self._value(member)
+        given = member.declaration.modifiers.get(rest[0]) if rest and member.declaration.value is None else None
+        if given is not None and not subscripts[at - 1]:  # one field: it may be what another field is computed from
+            out, rest, at = self._renamed(given, member.scopes, frozenset()), rest[1:], at + 1
+        else:
+            out = self._value(member)
         if subscripts[at - 1]:
             out = Part(out, None, subscripts[at - 1])
         for part, s in zip(rest, subscripts[at:], strict=True):

@@ -17,7 +17,7 @@ from ..errors import ModelError
 from ..expressions.branches import ALWAYS, NEVER, Needed, union, within
 from ..expressions.from_sympy import UnsupportedExpression, parts_of, symbols_of
 from ..expressions.smooth import Smooth
-from .events import LIVE, guard_of
+from .events import LIVE, has_guard
 from .symbols import RelationSymbol, TimeSymbol, VariableSymbol
 from .timed_relations import Edges, edges_of, in_relations_of_time, relations_in, whole_edges
 
@@ -513,12 +513,7 @@ def _can_turn(condition: Condition) -> bool:
     can be made both of it and of its negation."""
     if not varies(condition) or any(isinstance(s, RelationSymbol) for s in symbols_of(condition)):
         return False  # constant between events; or an event already
-    try:
-        for c in (condition, sympy.Not(condition)):
-            guard_of(c, "")
-    except ModelError:
-        return False
-    return True
+    return has_guard(condition) and has_guard(sympy.Not(condition))
 
 
 def _needed_where(roots: Sequence[Expression], order: list[Expression]) -> dict[Expression, Needed]:

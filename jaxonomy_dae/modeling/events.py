@@ -195,6 +195,20 @@ def guard_of(condition: Condition, where: str) -> sympy.Expr:
     return _refused(condition, where)
 
 
+def has_guard(condition: Condition) -> bool:
+    """True if `guard_of` can make a guard. It is not made: SymPy compares all sides of relations that `and` joins."""
+    if isinstance(condition, BooleanAtom | bool):
+        return False
+    if _is_discrete(condition):
+        return True
+    if isinstance(condition, sympy.Not):
+        return has_guard(to_nnf(condition))
+    if isinstance(condition, sympy.And | sympy.Or):
+        return all(_is_discrete(c) or has_guard(c) for c in condition.args)
+    ordered = sympy.LessThan | sympy.StrictLessThan | sympy.GreaterThan | sympy.StrictGreaterThan
+    return isinstance(condition, ordered)
+
+
 def is_strict(condition: Condition) -> bool:
     """True for conditions with a relation that is false where its sides are equal; False for clocks."""
     if isinstance(condition, sympy.Not):

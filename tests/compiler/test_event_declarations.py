@@ -18,6 +18,8 @@ from jaxonomy_dae import (
 )
 from jaxonomy_dae.library import hydraulic as hyd
 from jaxonomy_dae.library import signal as sig
+from jaxonomy_dae.modeling.events import guard_of, has_guard
+from jaxonomy_dae.modeling.symbols import DiscreteSymbol, VariableSymbol
 
 
 def clock_hand(self):
@@ -115,3 +117,23 @@ def test_what_blocks_refuse():
 def test_a_relief_valve_shuts_below_where_it_opens():
     with pytest.raises(ModelError, match="'valve': p_close must not be above p_open"):
         hyd.ReliefValve(EqnEnv(), "valve", p_open=1e6, p_close=4e6)
+
+
+def test_whether_a_condition_has_a_guard_is_known_without_making_it(monkeypatch):
+    """A condition that joins relations of long sums took SymPy half a minute: it compares all sides of the relations
+    when it makes their maximum. Only whether there is a guard was asked."""
+    x, y, d = VariableSymbol("x"), VariableSymbol("y"), DiscreteSymbol("d")
+    relations = [x > 1, y <= x, Eq(d, 1), Eq(x, 1), sympy.Ne(y, x), d > 0]
+    conditions = [*relations, *(join(a, b) for join in (sympy.And, sympy.Or) for a in relations for b in relations)]
+    conditions += [sympy.Not(c) for c in conditions]
+    expected = []
+    for c in conditions:
+        try:
+            guard_of(c, "")
+            expected.append(True)
+        except ModelError:
+            expected.append(False)
+    monkeypatch.setattr(sympy, "Max", None)
+    monkeypatch.setattr(sympy, "Min", None)
+    assert [has_guard(c) for c in conditions] == expected
+    assert {True, False} == set(expected)

@@ -49,14 +49,18 @@ package Shapes
       input Real r;
       output Real y;
     algorithm
-      y := r + data.offset + half;
+      y := r + data.offset + half + data.slope - slope(data);
     end shifted;
   end Round;
+  function slope
+    input Data data;
+    output Real y = data.slope;
+  end slope;
   record Data
     Real offset = 0.0;
     Real slope = 1.0;
   end Data;
-  constant Data standard(offset = 3.0);
+  constant Data standard(offset = 3.0, slope = 2*standard.offset);
   package Disc
     extends Round(final ratio = 10.0, data = standard);
     redeclare function extends area
