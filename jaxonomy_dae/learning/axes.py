@@ -1,17 +1,19 @@
 """Matplotlib axes for figures of data, fits and what is known of them (extra `plot`)."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
 from ..errors import ModelError, nearest
-from ..optional import pyplot
+from ..optional import Axes, pyplot
+
+AxesGiven: TypeAlias = Axes | Sequence[Axes] | np.ndarray | None  # an array of axes, or None: new ones
 
 LEGEND = 8  # up to this many entries, a legend is drawn
 
 
-def grid_of_axes(axes: Any, rows: int, columns: int, what: str, share: str = "col") -> np.ndarray:
+def grid_of_axes(axes: AxesGiven, rows: int, columns: int, what: str, share: str = "col") -> np.ndarray:
     """Axes of shape (rows, columns): those given, or new ones that share their times."""
     if axes is None:
         size = (min(3.2 * columns + 3.0, 14.0), 2.3 * rows + 0.9)

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction
-from ..optional import new_axes
+from ..optional import Axes, new_axes
 from ..programs.cache import compiled
 from .blocks import block_of
 from .program import weights_of, with_weights
@@ -41,7 +42,13 @@ class Band:
         points = self.grid.reshape(len(self.grid), -1)
         return np.all((points >= self.explored[:, 0]) & (points <= self.explored[:, 1]), axis=1)
 
-    def plot(self, ax: Any = None, *, truth: Any = None, label: str = "learned") -> Any:
+    def plot(
+        self,
+        ax: Axes | None = None,
+        *,
+        truth: ArrayLike | Callable[[np.ndarray], ArrayLike] | None = None,
+        label: str = "learned",
+    ) -> Axes:
         """Draws the law with its band and the region explored; returns Matplotlib axes.
 
         - `truth`: the true law, if it is known: a function of the grid, or values, shape `(n,)`.

@@ -36,9 +36,10 @@ class Blocks:
     def weighted(self, row: Float[np.ndarray, "e N m"], continuity: float, shift: Float[np.ndarray, "e M g"]):
         """Rows of data times their weights, and of continuity times one weight, with its residuals shifted."""
         return Blocks(
-            row * self.residual, row[..., None] * self.by_node, row[..., None] * self.by_common,
-            continuity * self.gap + shift, continuity * self.leave, continuity * self.arrive,
-            continuity * self.gap_by_common, self.first,
+            residual=row * self.residual, by_node=row[..., None] * self.by_node,
+            by_common=row[..., None] * self.by_common, gap=continuity * self.gap + shift,
+            leave=continuity * self.leave, arrive=continuity * self.arrive,
+            gap_by_common=continuity * self.gap_by_common, first=self.first,
         )  # fmt: skip
 
     @property

@@ -1,16 +1,19 @@
 """Chains of the No-U-Turn sampler (Hoffman & Gelman 2014, J. Mach. Learn. Res. 15:1593), by BlackJAX."""
 
-from typing import Any
+import types
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import SimulationError
 from ..optional import optional_module
 from ..programs.cache import compiled
 from .density import Posed, Program, density, density_and_gradient
+
+Begun: TypeAlias = tuple[Float[Array, " u"], Float[Array, ""], Float[Array, " u"]]  # a point, ln p, its gradient
 
 ACCEPTED = 0.8  # the share of proposals that the step size aims at, as Stan's
 DOUBLINGS = 8  # a trajectory has at most 2⁸ steps: whitened densities need less than ten
@@ -18,20 +21,21 @@ APART = 1.5  # standard deviations of the points where chains begin, in those of
 HALVINGS = 8  # of the way from the centre to where a chain begins, if a run fails there
 
 
-def blackjax() -> Any:
+def blackjax() -> types.ModuleType:
     """The library."""
     return optional_module("blackjax", "bayes", "posterior samples need BlackJAX")
 
 
 @compiled
 def chain(
-    program: Program, posed: Posed, warmup: int, draws: int, u: Float[Array, " u"], value: Any, gradient: Any, seed: Any
-) -> tuple[Float[Array, "draws u"], Any, Any, Any]:
-    """(points, ln p, whether the trajectory diverged, how many steps it had) of one chain from u, after `warmup` steps
-    in which the step size is found by dual averaging."""
+    program: Program, posed: Posed, warmup: int, draws: int, begun: Begun, seed: Int[Array, ""]
+) -> tuple[Float[Array, "draws u"], Float[Array, " draws"], Bool[Array, " draws"], Int[Array, " draws"]]:
+    """(points, ln p, whether the trajectory diverged, how many steps it had) of one chain from where it begins, after
+    `warmup` steps in which the step size is found by dual averaging."""
     mcmc = blackjax()
     kernel = mcmc.nuts.build_kernel()
     first, update, final = mcmc.adaptation.step_size.dual_averaging_adaptation(ACCEPTED)
+    u, value, gradient = begun
     size = len(u)
 
     def step(carry, row):
@@ -57,7 +61,7 @@ def chain(
     return jax.tree.map(lambda a: a[warmup:], found)
 
 
-def begin(program: Program, posed: Posed, rng: np.random.Generator) -> tuple[Float[Array, " u"], Any, Any]:
+def begin(program: Program, posed: Posed, rng: np.random.Generator) -> Begun:
     """The start of a chain, drawn around the centre, wider than the linearized density. Returns (point, ln p, its
     gradient)."""
     u = APART * rng.standard_normal(len(posed.centre))

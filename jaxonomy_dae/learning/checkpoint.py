@@ -10,19 +10,23 @@ import json
 import os
 import re
 import types
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 
+from ..aliases import PyTree
 from ..errors import ModelError
 
 KIND = "jaxonomy_dae training"
+Described: TypeAlias = "str | float | None | Sequence[Described]"  # what JSON keeps
+State = TypeVar("State", bound=PyTree)
 
 
-def fingerprint(tree: Any) -> str:
+def fingerprint(tree: PyTree) -> str:
     """A digest of all arrays and names in a pytree."""
     found = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
@@ -35,7 +39,7 @@ def fingerprint(tree: Any) -> str:
     return found.hexdigest()
 
 
-def described(value: Any, inside: tuple[Any, ...] = ()) -> Any:
+def described(value: object, inside: tuple[object, ...] = ()) -> Described:
     """Nested lists of texts that say which functions and settings a value consists of, alike in every process: a
     function by its code, by what it closes over and by the numbers that it reads from its module; a module by its class
     and fields. `inside` are the functions that the value belongs to, which may refer to themselves."""
@@ -62,8 +66,9 @@ def described(value: Any, inside: tuple[Any, ...] = ()) -> Any:
     if dataclasses.is_dataclass(value):
         fields = {f.name: getattr(value, f.name, None) for f in dataclasses.fields(value)}
         return [described(type(value)), described(fields, inside)]
-    if hasattr(value, "__wrapped__"):  # such as what `jax.jit` returns
-        return described(value.__wrapped__, inside)
+    wrapped = getattr(value, "__wrapped__", None)  # such as of what `jax.jit` returns
+    if wrapped is not None:
+        return described(wrapped, inside)
     return _ADDRESS.sub("", repr(value))
 
 
@@ -71,14 +76,14 @@ _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 _NUMBERS = (bool, int, float, complex, str, np.ndarray, np.generic, jax.Array)
 
 
-def _content(cell: types.CellType) -> Any:
+def _content(cell: types.CellType) -> object:
     try:
         return cell.cell_contents
     except ValueError:  # not yet filled
         return None
 
 
-def _code(code: types.CodeType) -> list[Any]:
+def _code(code: types.CodeType) -> list[Described]:
     constants = [
         _code(c) if isinstance(c, types.CodeType) else sorted(map(repr, c)) if isinstance(c, frozenset) else repr(c)
         for c in code.co_consts
@@ -86,17 +91,17 @@ def _code(code: types.CodeType) -> list[Any]:
     return [code.co_code.hex(), list(code.co_names), constants]
 
 
-def save(path: Any, facts: dict[str, Any], state: Any) -> None:
+def save(path: str | Path, facts: Mapping[str, Described], state: PyTree) -> None:
     """Writes a checkpoint; a file that was there stays whole until the new one is."""
     path = Path(path)
     draft = path.with_name(path.name + ".part")
     with open(draft, "wb") as file:
-        file.write((json.dumps({"kind": KIND} | facts) + "\n").encode())
+        file.write((json.dumps({"kind": KIND, **facts}) + "\n").encode())
         eqx.tree_serialise_leaves(file, state)
     os.replace(draft, path)
 
 
-def read_facts(path: Any, expected: dict[str, Any]) -> dict[str, Any]:
+def read_facts(path: str | Path, expected: Mapping[str, Described]) -> dict[str, Any]:
     """The first line of a checkpoint.
 
     **Raises:**
@@ -122,7 +127,7 @@ def read_facts(path: Any, expected: dict[str, Any]) -> dict[str, Any]:
     return facts
 
 
-def read_state(path: Any, like: Any) -> Any:
+def read_state(path: str | Path, like: State) -> State:
     """The arrays of a checkpoint, in a pytree like the one given.
 
     **Raises:**

@@ -203,7 +203,7 @@ def coordinates(
         name, interval, value = table.names[k], table.intervals[k], float(numbers[k])
         log = is_positive(interval)
         size = 1.0 if log else abs(value) or 1.0
-        rows.append(Coordinate(name, table.units[k], name, False, log, size, value, low, high))
+        rows.append(Coordinate(name, table.units[k], name, False, log, size, value, low=low, high=high))
     for name in layout.modules:
         module = system.neural[name] if name in system.neural else observers[name]
         for one, value in _named_weights(name, module):
@@ -218,13 +218,12 @@ def coordinates(
     for k, label in enumerate(stacked.labels):
         for name in layout.own:
             rows.append(_start(f"{name}, {label}", units, name, stacked.starts[name][k], table))
-    names, unit, group, is_weight, log, size, start, low, high, spread, fixed, centre = zip(*rows, strict=True)
-    columns = (np.array(column, float) for column in (size, start, low, high, spread, centre))
-    size, start, low, high, spread, centre = columns
+    columns = {name: [getattr(row, name) for row in rows] for name in Coordinate._fields}
+    names, units, group = (tuple(columns.pop(name)) for name in ("name", "unit", "group"))
+    arrays = {name: np.array(column) for name, column in columns.items()}
     return Coordinates(
-        names, unit, group, np.array(is_weight), np.array(log), size, start, low, high, spread, centre,
-        np.array(fixed), n_shared, len(layout.own), len(stacked.labels),
-    ).with_priors(priors)  # fmt: skip
+        names, units, group, **arrays, n_shared=n_shared, n_own=len(layout.own), experiments=len(stacked.labels)
+    ).with_priors(priors)
 
 
 def is_positive(interval: Interval) -> bool:
@@ -260,4 +259,7 @@ def _start(label: str, units: dict[str, str], name: str, given: Any, table: Para
     size = 1.0 if log else spread if math.isfinite(spread) else abs(guess) or 1.0
     spread /= guess if log else size
     centre = math.log(guess) if log else guess / size
-    return Coordinate(label, units.get(name, ""), name, False, log, size, guess, low, high, spread, known, centre)
+    return Coordinate(
+        label, units.get(name, ""), name, False, log, size, guess, low=low, high=high, spread=spread, fixed=known,
+        centre=centre,
+    )  # fmt: skip

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..system.inputs import KINDS
-from .axes import LEGEND, chosen_names, grid_of_axes
+from .axes import LEGEND, AxesGiven, chosen_names, grid_of_axes
 from .experiment import Experiment, Unknown, check_increasing
 from .noise import Noise
 
@@ -43,7 +43,7 @@ class Data:
         counts = (f"{label}: {len(e.times)} times" for label, e in zip(self.labels, self.experiments, strict=True))
         return f"Data({', '.join(counts)})"
 
-    def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None) -> Any:
+    def plot(self, names: str | Sequence[str] | None = None, *, axes: AxesGiven = None) -> np.ndarray:
         """Draws the records over time, one row of axes for each name; returns Matplotlib axes."""
         known = list(dict.fromkeys(name for one in self.experiments for name in one.data))
         chosen = chosen_names(names, known, "data of")

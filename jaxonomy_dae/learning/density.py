@@ -17,12 +17,13 @@ forwards, experiment by experiment, as those of a fit are, or backwards where th
 they go backwards.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import ModelError
@@ -91,7 +92,7 @@ def between(
     return z, jnp.where(two, slope, jnp.where(has_low, y, jnp.where(has_high, -y, 0.0)))
 
 
-def coordinates_at(posed: Posed, u: Float[Array, "*n u"]) -> tuple[Any, Any, Any]:
+def coordinates_at(posed: Posed, u: Float[Array, "*n u"]) -> tuple[Array, Array, Array]:
     """(coordinates sampled, logarithms of noise levels, Σ ln dz/dy) at u."""
     v = posed.centre + u @ posed.root.T
     f = len(posed.chosen)
@@ -157,7 +158,7 @@ def density(program: Program, posed: Posed, u: Float[Array, " u"]) -> Float[Arra
 
 
 @compiled
-def density_and_gradient(program: Program, posed: Posed, u: Float[Array, " u"]) -> tuple[Any, Any]:
+def density_and_gradient(program: Program, posed: Posed, u: Float[Array, " u"]) -> tuple[Array, Array]:
     """ln p and its gradient."""
     return jax.value_and_grad(lambda u: density(program, posed, u))(u)
 
@@ -193,7 +194,7 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     found = objective.sigma(z, weights)
     centre = np.concatenate([y, np.log([found[name] for name in names])])
 
-    def array(values: Any) -> Any:
+    def array(values: ArrayLike) -> Array:
         return jnp.asarray(values, dtype)
 
     priors = weights.prior(z)
@@ -201,9 +202,10 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     bends, bend = priors.jacobian[bent], priors.residual[bent] - priors.jacobian[bent] @ z
     levels = Levels(jnp.asarray(sampled), jnp.asarray(place), array(np.where(sampled, counts, 0.0)))
     told = Posed(
-        objective.weighted, levels, array(c.natural(estimate.point)), jnp.asarray(np.flatnonzero(free)),
-        jnp.asarray(c.log[free]), array(c.size[free]), array(low), array(high), array(weights.precision),
-        array(weights.mean), array(bends), array(bend), array(centre), array(root),
+        told=objective.weighted, levels=levels, natural=array(c.natural(estimate.point)),
+        chosen=jnp.asarray(np.flatnonzero(free)), log=jnp.asarray(c.log[free]), size=array(c.size[free]),
+        low=array(low), high=array(high), precision=array(weights.precision), mean=array(weights.mean),
+        bends=array(bends), bend=array(bend), centre=array(centre), root=array(root),
     )  # fmt: skip
     backwards = objective.has_many and isinstance(objective.predictor, Runs)  # filters are differentiated forwards
     predictor = Runs(None) if backwards else objective.predictor

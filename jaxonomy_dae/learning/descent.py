@@ -167,7 +167,9 @@ class _Here:
         left = offset(factors, merit.noise)
         is_minimum = is_minimum or left <= OFFSET
         following, change = (weights, 0.0) if reweigh is None else reweigh(z, found, weights, factors, free, is_minimum)
-        return cls(z, found, weights, rows, cost, free, factors, following, change, left)
+        return cls(
+            z, found, weights, rows, cost, free=free, factors=factors, following=following, change=change, left=left
+        )
 
     def open(self, merit: AbstractMerit) -> tuple[float, float]:
         """By how much of their standard deviations a full step moves (the coordinates that are reported, at most; the
@@ -273,8 +275,8 @@ def descend(
         here, polished = _polished(merit, here, bounds, reweigh, history)
         count += polished
     return Minimum(
-        here.z, here.found, here.weights, here.cost, history, count, converged, reason, merit.noise, here.left,
-        merit.noise,
+        here.z, here.found, here.weights, here.cost, history=history, evaluations=count, converged=converged,
+        message=reason, noise=merit.noise, left=here.left, tolerance=merit.noise,
     )  # fmt: skip
 
 

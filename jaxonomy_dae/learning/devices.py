@@ -7,16 +7,22 @@ device, so that the steps of a fit, a small matter beside them, are taken everyw
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array
 
+from ..aliases import PyTree
 from ..errors import ModelError
 
+Found = TypeVar("Found", bound=PyTree)
+# A function of numbers that experiments share, those of one experiment, and its conditions.
+Function = Callable[[Array, Array, PyTree], Found]
 
-def each(function: Callable, mesh: Mesh | None, shared: Any, own: Any, conditions: Any) -> Any:
+
+def each(function: Function[Found], mesh: Mesh | None, shared: Array, own: Array, conditions: PyTree) -> Found:
     """`function(shared, own, conditions)` of each experiment, on the devices of a mesh if there is one."""
     if mesh is None:
         return _batch(function, shared, own, conditions)
@@ -34,8 +40,8 @@ def each(function: Callable, mesh: Mesh | None, shared: Any, own: Any, condition
 
 
 def each_with_slopes(
-    function: Callable, mesh: Mesh | None, shared: Any, own: Any, conditions: Any
-) -> tuple[Any, Any, Any]:
+    function: Function[Found], mesh: Mesh | None, shared: Array, own: Array, conditions: PyTree
+) -> tuple[Found, Found, Found]:
     """As `each`, with derivatives, found forwards: (values, derivatives by the shared numbers, by each experiment's
     own)."""
 
@@ -50,7 +56,7 @@ def each_with_slopes(
     return each(with_slopes, mesh, shared, own, conditions)
 
 
-def _batch(function: Callable, shared: Any, own: Any, conditions: Any) -> Any:
+def _batch(function: Function[Found], shared: Array, own: Array, conditions: PyTree) -> Found:
     """A single experiment is not made a batch, which costs compile time."""
     if own.shape[0] == 1:
         found = function(shared, own[0], jax.tree.map(lambda a: a[0], conditions))
@@ -58,7 +64,7 @@ def _batch(function: Callable, shared: Any, own: Any, conditions: Any) -> Any:
     return jax.vmap(function, in_axes=(None, 0, 0))(shared, own, conditions)
 
 
-def check_mesh(mesh: Any) -> Mesh | None:
+def check_mesh(mesh: object) -> Mesh | None:
     """The mesh given, or a `ModelError`."""
     if mesh is None:
         return None

@@ -10,8 +10,10 @@ import scipy.stats
 from jaxtyping import Float
 
 from ..errors import ModelError, nearest
+from ..optional import Axes
 from ..system.system import AcausalSystem
 from .agreement import Whiteness, correlated, log_likelihood, rms_by_name, whiteness
+from .axes import AxesGiven
 from .band import Band, band, explored
 from .descent import Minimum
 from .discovery import Discovery, discover
@@ -413,21 +415,23 @@ class Estimate:
         """
         return discover(self, name, terms, width, most)
 
-    def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None, level: float = 0.95) -> Any:
+    def plot(
+        self, names: str | Sequence[str] | None = None, *, axes: AxesGiven = None, level: float = 0.95
+    ) -> np.ndarray:
         """Draws samples, and fitted runs with their bands at the times of the samples. Rows of axes are names; columns
         are the first four experiments. Returns Matplotlib axes."""
         outputs, spread = self.at_samples
         return plot_runs(self.objective, outputs, self.quantile(level) * spread, names, axes)
 
-    def plot_residuals(self, *, axes: Any = None) -> Any:
+    def plot_residuals(self, *, axes: AxesGiven = None) -> np.ndarray:
         """Draws residuals in units of the noise over time, and their autocorrelation; returns Matplotlib axes."""
         return plot_residuals(self.objective, self.minimum, axes)
 
-    def plot_history(self, ax: Any = None) -> Any:
+    def plot_history(self, ax: Axes | None = None) -> Axes:
         """Draws the misfit over the steps; returns Matplotlib axes."""
         return plot_history(self.minimum, ax)
 
-    def plot_correlations(self, ax: Any = None) -> Any:
+    def plot_correlations(self, ax: Axes | None = None) -> Axes:
         """Draws the correlations of parameters and starts; returns Matplotlib axes."""
         return plot_correlations(self.objective, self.correlation, ax)
 

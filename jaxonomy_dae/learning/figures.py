@@ -1,13 +1,13 @@
 """Figures of fits."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import ModelError
-from ..optional import axis_label, legend_beside, new_axes
-from .axes import LEGEND, chosen_names, grid_of_axes
+from ..optional import Axes, axis_label, legend_beside, new_axes
+from .axes import LEGEND, AxesGiven, chosen_names, grid_of_axes
 from .descent import Minimum
 from .objective import Objective
 
@@ -17,8 +17,12 @@ WRITTEN = 12  # up to this many names, correlations are written into their cells
 
 
 def plot_runs(
-    objective: Objective, outputs: Float[np.ndarray, "e n k"], half: Float[np.ndarray, "e n k"], names: Any, axes: Any
-) -> np.ndarray:
+    objective: Objective,
+    outputs: Float[np.ndarray, "e n k"],
+    half: Float[np.ndarray, "e n k"],
+    names: str | Sequence[str] | None,
+    axes: AxesGiven,
+) -> np.ndarray:  # fmt: skip
     """Samples and the fitted runs with bands that go `half` to each side: rows of axes for names, columns for
     experiments; after four experiments, the rows begin anew."""
     s, variables = objective.stacked, objective.system.plan.flat.variables
@@ -27,10 +31,11 @@ def plot_runs(
     shown = min(len(s.labels), MOST)
     columns = min(shown, SIDE_BY_SIDE)
     groups = -(-shown // columns)
-    axes = grid_of_axes(axes, len(chosen) * groups, columns, "a plot of data and runs", "all" if groups > 1 else "col")
+    grid = grid_of_axes(axes, len(chosen) * groups, columns, "a plot of data and runs", "all" if groups > 1 else "col")
     for place in np.ndindex(groups, len(chosen), columns):
         group, row, column = place
-        k, ax, name = group * columns + column, axes[group * len(chosen) + row, column], chosen[row]
+        k, name = group * columns + column, chosen[row]
+        ax = grid.item(group * len(chosen) + row, column)
         if k >= shown:
             ax.set_visible(False)
             continue
@@ -45,15 +50,15 @@ def plot_runs(
             ax.set_ylabel(axis_label(name, units.get(name)))
         if row == 0 and len(s.labels) > 1:
             ax.set_title(s.labels[k] + " (held out)" * bool(s.holdout[k]), loc="left", fontsize="medium")
-    for ax in axes[-1]:
+    for ax in grid[-1]:
         ax.set_xlabel("Time / s")
-    legend_beside(axes[0, columns - 1])
+    legend_beside(grid[0, columns - 1])
     if len(s.labels) > shown:
-        axes[0, -1].annotate(f"and {len(s.labels) - shown} more", (1, 1.01), xycoords="axes fraction", ha="right")
-    return axes
+        grid[0, -1].annotate(f"and {len(s.labels) - shown} more", (1, 1.01), xycoords="axes fraction", ha="right")
+    return grid
 
 
-def plot_residuals(objective: Objective, minimum: Minimum, axes: Any) -> np.ndarray:
+def plot_residuals(objective: Objective, minimum: Minimum, axes: AxesGiven) -> np.ndarray:
     """Residuals in units of the noise over time, and their autocorrelation: rows of axes for names."""
     s = objective.stacked
     rows, scaled = objective.rows, minimum.weights.scale * minimum.found.residual
@@ -88,7 +93,7 @@ def plot_residuals(objective: Objective, minimum: Minimum, axes: Any) -> np.ndar
     return axes
 
 
-def plot_history(minimum: Minimum, ax: Any) -> Any:
+def plot_history(minimum: Minimum, ax: Axes | None) -> Axes:
     """Draws how the misfit came down, step by step; returns the axes."""
     ax = new_axes(ax)
     history = np.array(minimum.history, float)
@@ -99,7 +104,7 @@ def plot_history(minimum: Minimum, ax: Any) -> Any:
     return ax
 
 
-def plot_correlations(objective: Objective, correlation: Float[np.ndarray, "p p"], ax: Any) -> Any:
+def plot_correlations(objective: Objective, correlation: Float[np.ndarray, "p p"], ax: Axes | None) -> Axes:
     """Correlations of what was estimated, weights of networks left out."""
     c = objective.coordinates
     chosen = np.flatnonzero(objective.free & ~c.is_weight)

@@ -234,7 +234,9 @@ def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: 
         guess = float(value)
     low, high = (guess / FAR, guess * FAR) if log else (-math.inf, math.inf)
     centre = math.log(guess) if log else guess / size
-    return Coordinate(name, unit, name, False, log, size, guess, low, high, spread, known, centre)
+    return Coordinate(
+        name, unit, name, False, log, size, guess, low=low, high=high, spread=spread, fixed=known, centre=centre
+    )
 
 
 def _noise_unit(place: int | str, unit: str) -> str:

@@ -6,12 +6,11 @@ that, or more.
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..optional import new_axes
+from ..optional import Axes, new_axes
 from .evaluation import Evaluation, Weights
 from .factors import Factors
 from .objective import Objective
@@ -65,7 +64,7 @@ class Identifiability:
             lines.append(text)
         return "\n".join(lines)
 
-    def plot(self, ax: Any = None) -> Any:
+    def plot(self, ax: Axes | None = None) -> Axes:
         """Draws the eigenvalues of the scaled Fisher information; returns Matplotlib axes."""
         ax = new_axes(ax)
         floor = np.finfo(float).tiny

@@ -237,8 +237,9 @@ def shoot(
     found = segments.evaluation(point)
     noise = _noise(merit, point, merit.weights.applied(point.z, found).jacobian, tolerance)
     return ShootingMinimum(
-        point.z, found, merit.weights, merit.weights.cost(point.z, found.residual), history, descent.evaluations,
-        converged, message, noise, remaining, tolerance, segments.nodes[:, :-1], point.states, point.blocks.gap,
+        point.z, found, merit.weights, merit.weights.cost(point.z, found.residual), history=history,
+        evaluations=descent.evaluations, converged=converged, message=message, noise=noise, left=remaining,
+        tolerance=tolerance, nodes=segments.nodes[:, :-1], states=point.states, gaps=point.blocks.gap,
     )  # fmt: skip
 
 

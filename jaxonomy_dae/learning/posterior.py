@@ -186,7 +186,7 @@ def sample(estimate: "Estimate", draws: int, chains: int, warmup: int, seed: int
         for k in range(chains):
             point = begin(program, told, rng)
             key = jnp.asarray(np.random.SeedSequence([seed, k]).generate_state(1)[0] >> 1, jnp.int32)
-            found.append(chain(program, told, warmup, draws, *point, key))
+            found.append(chain(program, told, warmup, draws, point, key))
     u, density, diverged, steps = (np.stack([np.asarray(one[j]) for one in found]) for j in range(4))
     z, logs, _ = coordinates_at(told, jnp.asarray(u, told.centre.dtype))
     points = np.broadcast_to(estimate.point, (*u.shape[:2], len(estimate.point))).copy()

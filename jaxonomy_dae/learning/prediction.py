@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import ModelError, nearest
-from .axes import chosen_names, grid_of_axes
+from .axes import AxesGiven, chosen_names, grid_of_axes
 from .objective import Objective, Predicted
 from .program import Conditions, predict_and_differentiate
 
@@ -35,7 +35,7 @@ class Prediction:
         columns = mean, spread, mean - factor * spread, mean + factor * spread
         return cls(ts, *(dict(zip(names, column.T, strict=True)) for column in columns))
 
-    def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None) -> Any:
+    def plot(self, names: str | Sequence[str] | None = None, *, axes: AxesGiven = None) -> np.ndarray:
         """Draws variables with their bands, one below the other; returns Matplotlib axes."""
         chosen = chosen_names(names, list(self.mean), "predictions of")
         axes = grid_of_axes(axes, len(chosen), 1, "a plot of predictions")

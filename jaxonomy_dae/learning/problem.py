@@ -144,9 +144,9 @@ class Problem:
             )
         lengths = tuple(sorted(set(stacked.counts))) if self.observers else ()
         return Layout(
-            stacked.outputs, tuple(parameters), tuple(modules), tuple(shared), tuple(own), tuple(known), stacked.kinds,
-            tuple(self._options.items()), tuple(e.name for e in extras), lengths if len(lengths) > 1 else (),
-            self._mesh,
+            stacked.outputs, parameters=tuple(parameters), modules=tuple(modules), shared=tuple(shared),
+            own=tuple(own), known=tuple(known), kinds=stacked.kinds, options=tuple(self._options.items()),
+            extra=tuple(e.name for e in extras), lengths=lengths if len(lengths) > 1 else (), mesh=self._mesh,
         )  # fmt: skip
 
     @property
@@ -379,7 +379,10 @@ class Problem:
             if found is None:
                 return None
             cost = weights.cost(start, found.residual)
-            return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol, 0.0, rtol)
+            return Minimum(
+                start, found, weights, cost, history=[cost], evaluations=1, converged=True,
+                message="nothing is searched", noise=rtol, left=0.0, tolerance=rtol,
+            )  # fmt: skip
         return objective.lowest(start, weights=weights)
 
     def run(self, objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:

@@ -3,7 +3,6 @@ at a point."""
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from .block_elimination import Blocks, condensed
 from .evaluation import Evaluation
 from .objective import Objective
-from .program import Conditions
-from .shooting_program import Cut, first_states, on_constraints, run_segments
+from .program import Conditions, Owns, Shared
+from .shooting_program import Cut, Ran, first_states, on_constraints, run_segments
 
 ITERATIONS = 8  # Gauss–Newton steps onto the constraints
 
@@ -127,7 +126,7 @@ class Segments:
 
     # --- at a point --------------------------------------------------------------------------------------------
 
-    def _numbers(self, z: Float[np.ndarray, " f"]) -> tuple[Any, Any]:
+    def _numbers(self, z: Float[np.ndarray, " f"]) -> tuple[Shared, Owns]:
         c = self.objective.coordinates
         shared, own = self.objective.numbers(c.natural(self.objective.full(z)))
         return shared, own[self.experiments]
@@ -193,20 +192,22 @@ class Segments:
         # At constant coefficients, parameters move a projected state off its tangent space.
         along = first[1][:, :n_first] - starts["c"][:, 0]
         blocks = Blocks(
-            data.reshape(shape),
-            at_samples(node("outputs")),
-            at_samples(common("outputs")),
-            gap,
-            ends["d"][:, :-1] / scale,
-            starts["d"][:, 1:] / scale,
-            (ends["c"][:, :-1] - starts["c"][:, 1:]) / scale,
-            np.linalg.pinv(directions[:, 0, :n_first]) @ along,
+            residual=data.reshape(shape),
+            by_node=at_samples(node("outputs")),
+            by_common=at_samples(common("outputs")),
+            gap=gap,
+            leave=ends["d"][:, :-1] / scale,
+            arrive=starts["d"][:, 1:] / scale,
+            gap_by_common=(ends["c"][:, :-1] - starts["c"][:, 1:]) / scale,
+            first=np.linalg.pinv(directions[:, 0, :n_first]) @ along,
         )
         if not all(np.isfinite(a).all() for a in dataclasses.asdict(blocks).values()):
             return None
         return Point(z, start, directions, blocks)
 
-    def _run(self, z: Any, states: Any, size: Any) -> tuple[Any, Any] | None:
+    def _run(
+        self, z: Float[np.ndarray, " f"], states: Float[np.ndarray, "e N n"], size: Float[np.ndarray, " n"]
+    ) -> tuple[np.ndarray, tuple[Ran, Ran]] | None:
         """The directions in which nodes move, and all segments run from states near the constraints."""
         o, (shared, own) = self.objective, self._numbers(z)
         states, directions = self._moves(shared, own, states, size)
@@ -220,7 +221,9 @@ class Segments:
         found = self._run(z, states, np.ones(states.shape[-1]))
         return np.full_like(states, np.nan) if found is None else np.asarray(found[1][0].end, np.float64)
 
-    def _moves(self, shared: Any, own: Any, states: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _moves(
+        self, shared: Shared, own: Owns, states: Float[np.ndarray, "e N n"], size: Float[np.ndarray, " n"]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The states on the constraints, and at each of them directions that keep to these, orthonormal in units of
         `size`, shape (e, N, n, d)."""
         o = self.objective

@@ -1,8 +1,6 @@
 """The compiled programs of multiple shooting: all segments of all experiments at once, as one batch, with derivatives
 by what they share, by what each experiment has to itself, and by the states at their nodes."""
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
@@ -13,7 +11,7 @@ from jaxtyping import Array, Float
 from ..programs.cache import compiled
 from ..simulation.simulate import simulate
 from .devices import each, each_with_slopes
-from .program import Conditions, Setting, outputs_of, placed, run_end, with_kinds
+from .program import Conditions, Inputs, Owns, Setting, Shared, outputs_of, placed, run_end, with_kinds
 
 
 class Cut(eqx.Module):
@@ -23,7 +21,7 @@ class Cut(eqx.Module):
     times: Float[Array, "e N l"]
     t0: Float[Array, "e N"]
     known: Float[Array, "e known"]
-    inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
+    inputs: Inputs
 
 
 class Ran(eqx.Module):
@@ -36,7 +34,7 @@ class Ran(eqx.Module):
 
 @compiled
 def first_states(
-    setting: Setting, shared: Any, own: Any, conditions: Conditions
+    setting: Setting, shared: Shared, own: Owns, conditions: Conditions
 ) -> tuple[Float[Array, "e n"], Float[Array, "e n s"], Float[Array, "e n o"]]:
     """The states at which experiments start, and their derivatives by the shared numbers and by each one's own."""
 
@@ -49,7 +47,7 @@ def first_states(
 
 @compiled
 def on_constraints(
-    setting: Setting, iterations: int, shared: Any, own: Any, states: Any, cut: Cut
+    setting: Setting, iterations: int, shared: Shared, own: Owns, states: Float[Array, "e N n"], cut: Cut
 ) -> tuple[Float[Array, "e N n"], Float[Array, "e N n f"]]:
     """The states at the nodes moved onto the constraints, and the derivatives there of this projection by the f
     differential states."""
@@ -71,14 +69,21 @@ def on_constraints(
 
 @compiled
 def run_segments(
-    setting: Setting, moving: tuple[int, ...], shared: Any, own: Any, states: Any, bases: Any, cut: Cut
+    setting: Setting,
+    moving: tuple[int, ...],
+    shared: Shared,
+    own: Owns,
+    states: Float[Array, "e N n"],
+    bases: Float[Array, "e N n d"],
+    cut: Cut,
 ) -> tuple[Ran, Ran]:
     """All segments, from states at the nodes; and their derivatives, in a last axis, by numbers common to segments, at
     the places `moving` in [shared | own], and by the coefficients of `bases`, shape (e, N, n, d), along which nodes
     move."""
     layout, count, places = setting.layout, len(moving), np.array(moving, int)
 
-    def one(moved, shared, own, x, basis, times, t0, c):
+    def one(moved, shared, own, segment, c):
+        x, basis, times, t0 = segment
         both = jnp.concatenate([shared, own]).at[places].set(moved[:count])
         shared, own = both[: len(shared)], both[len(shared) :]
         delta = moved[count:]
@@ -90,17 +95,15 @@ def run_segments(
         found = Ran(outputs_of(solution, laws, layout, times.dtype), solution.states[0], solution.states[-1])
         return found, found
 
-    def with_slopes(shared, own, x, basis, times, t0, c):
+    def with_slopes(shared, own, segment, c):
+        basis = segment[1]
         moved = jnp.concatenate([jnp.concatenate([shared, own])[places], jnp.zeros(basis.shape[-1:], basis.dtype)])
-        slopes, found = jax.jacfwd(one, has_aux=True)(moved, shared, own, x, basis, times, t0, c)
+        slopes, found = jax.jacfwd(one, has_aux=True)(moved, shared, own, segment, c)
         return found, slopes
 
     def segments(shared, own, told):
         states, bases, c = told
 
-        def segment(x, basis, times, t0):
-            return with_slopes(shared, own, x, basis, times, t0, c)
-
-        return jax.vmap(segment)(states, bases, c.times, c.t0)
+        return jax.vmap(lambda segment: with_slopes(shared, own, segment, c))((states, bases, c.times, c.t0))
 
     return each(segments, layout.mesh, shared, own, (states, bases, cut))

@@ -4,11 +4,10 @@ import dataclasses
 import html
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
-from ..optional import new_axes
+from ..optional import Axes, new_axes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Table:
         widths = [max(len(line[k]) for line in cells) for k in range(5)]
         return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
 
-    def plot(self, ax: Any = None, *, true: Mapping[str, float] | None = None) -> Any:
+    def plot(self, ax: Axes | None = None, *, true: Mapping[str, float] | None = None) -> Axes:
         """Draws the intervals relative to the values, with crosses at the `true` values that are given by name; returns
         Matplotlib axes."""
         rows = self.rows

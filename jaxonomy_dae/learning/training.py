@@ -4,7 +4,6 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,10 +12,11 @@ import numpy as np
 import optax
 from jaxtyping import Float
 
+from ..aliases import PyTree
 from ..errors import ModelError, SimulationError, whole_number
-from ..optional import new_axes
+from ..optional import Axes, new_axes
 from .beginnings import silent
-from .checkpoint import described, fingerprint, read_facts, read_state, save
+from .checkpoint import Described, described, fingerprint, read_facts, read_state, save
 from .evaluation import Evaluation, Weights
 from .gradient import Batches
 from .objective import Objective
@@ -48,8 +48,8 @@ class GradientSteps:
     batch: int | None = None
     horizons: Sequence[float] = (1.0,)
     patience: int | None = None
-    callback: Callable[["Update"], Any] | None = None
-    checkpoint: Any = None
+    callback: Callable[["Update"], object] | None = None
+    checkpoint: str | Path | None = None
     every: int = 20
     seed: int = 0
 
@@ -111,7 +111,7 @@ class Training:
         """Parameters, starts and weights by name, at the best point."""
         return values_at(self.objective, self.z)
 
-    def plot(self, ax: Any = None) -> Any:
+    def plot(self, ax: Axes | None = None) -> Axes:
         """Draws the history and the scores of held-out experiments; returns Matplotlib axes."""
         ax = new_axes(ax)
         ax.semilogy(np.arange(len(self.history)), np.sqrt(2 * self.history), label="fitted")
@@ -136,7 +136,7 @@ class State:
 
     z: Float[np.ndarray, " f"]
     best: Float[np.ndarray, " f"]
-    optimizer: Any
+    optimizer: optax.OptState
     weights: Weights
     history: list[float]
     scored: list[int]
@@ -149,7 +149,7 @@ class State:
         """The number of updates that were taken."""
         return len(self.history)
 
-    def arrays(self) -> Any:
+    def arrays(self) -> list[PyTree]:
         """The arrays that a checkpoint keeps."""
         w = self.weights
         return [
@@ -176,7 +176,7 @@ def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSt
     state = State(z, z, optimizer, weights, [], [], [])
     facts = _facts(objective, plan, optimizer)
     if plan.checkpoint is not None and Path(plan.checkpoint).exists():
-        state = _resumed(plan, facts, state, stages)
+        state = _resumed(plan.checkpoint, facts, state)
     message, stopped = "", False
     writes = objective.layout.mesh is None or jax.process_index() == 0  # one process of all that train together
     while state.step < plan.steps and not stopped:
@@ -239,7 +239,7 @@ def _weights(batches: Batches, z: Float[np.ndarray, " f"]) -> Weights | None:
     return None if found is None else o.weights(z, found)
 
 
-def _facts(objective: Objective, plan: GradientSteps, optimizer: Any) -> dict[str, Any]:
+def _facts(objective: Objective, plan: GradientSteps, optimizer: optax.OptState) -> dict[str, Described]:
     """The facts that must agree for a checkpoint to fit, by name."""
     s, c = objective.stacked, objective.coordinates
     data = [
@@ -276,19 +276,19 @@ def _facts(objective: Objective, plan: GradientSteps, optimizer: Any) -> dict[st
     }
 
 
-def _resumed(plan: GradientSteps, facts: dict[str, Any], like: State, stages: dict[float, Batches]) -> State:
+def _resumed(path: str | Path, facts: dict[str, Described], like: State) -> State:
     """The state in a checkpoint."""
-    counts = read_facts(plan.checkpoint, facts)
+    counts = read_facts(path, facts)
     taken, scored, rows = (int(counts[name]) for name in ("taken", "scored", "rows"))
     shape = dataclasses.replace(
         like, history=[0.0] * taken, scored=[0] * scored, scores=[0.0] * scored,
         weights=dataclasses.replace(like.weights, row=np.zeros(rows), share=np.zeros(rows)),
     )  # fmt: skip
     z, best, optimizer, row, precision, mean, share, history, at, scores, best_step, best_value = read_state(
-        plan.checkpoint, shape.arrays()
+        path, shape.arrays()
     )
     weights = dataclasses.replace(like.weights, row=row, precision=precision, mean=mean, share=share)
     return State(
-        z, best, optimizer, weights, history.tolist(), at.tolist(), scores.tolist(),
-        int(best_step), float(best_value),
+        z, best, optimizer, weights, history=history.tolist(), scored=at.tolist(), scores=scores.tolist(),
+        best_step=int(best_step), best_value=float(best_value),
     )  # fmt: skip
