@@ -130,8 +130,8 @@ def _with_whens(scope: Scope, value: Value, within: tuple[Branches, ...] = ()) -
         if s in within or not isinstance(value, sympy.Basic) or not value.free_symbols & targets:
             continue
         condition = scope.evaluate(s.branches[0][0])
-        if isinstance(condition, bool | Sampled) or not is_condition(condition):
-            continue
+        if isinstance(condition, bool | Sampled) or not is_condition(condition) or condition.atoms(PreviousSymbol):
+            continue  # `change(…)` holds at an instant only: what the mode reads is changed when it has happened
         done = scope.done.get(s)
         if done is None:
             done = scope.done[s] = _hidden(scope, f":done[{len(scope.done)}]", 1)
