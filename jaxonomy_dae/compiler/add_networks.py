@@ -2,13 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction, OpaqueTemplate
 from ..model.provenance import Provenance, Provenances, Written
-from ..model.tables import RowInjection, VariableTable
+from ..model.tables import EquationGroup, RowInjection, VariableTable
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.symbols import TimeSymbol, VariableSymbol
 from .group_builder import GroupBuilder
@@ -51,18 +52,66 @@ def _add_opaque(
     )
 
 
-def add_corrections(model: ModelNumbers, diagram: AcausalDiagram, variables: VariableTable, groups, networks):
+@dataclasses.dataclass(frozen=True)
+class _Correction:
+    """A block of learned corrections: the function, and what it corrects and reads, by numbers of variables."""
+
+    opaque: OpaqueFunction
+    targets: tuple[int, ...]
+    inputs: tuple[int, ...]
+    inject: str
+
+
+def add_corrections(
+    model: ModelNumbers,
+    diagram: AcausalDiagram,
+    variables: VariableTable,
+    groups: tuple[EquationGroup, ...],
+    networks: dict[str, Any],
+) -> tuple[VariableTable, tuple[EquationGroup, ...], tuple[RowInjection, ...]]:
     """Adds the learned corrections.
 
     `equation`: for a target v with corrections w₁, w₂, …, every equation that mentions dv/dt reads instead a new
     variable u, and dv/dt = u + w₁ + w₂ + … is added. `row`: kept for lowering.
     """
-    rows: list[RowInjection] = []
+    found = _corrections(model, diagram, variables, groups, networks)
+    rows = tuple(RowInjection(c.opaque, c.targets, c.inputs) for c in found if c.inject == "row")
+    found = [c for c in found if c.inject != "row"]
+    if not found:
+        return variables, groups, rows
+    names, builder = list(variables.names), GroupBuilder()
     corrections: dict[int, list[int]] = {}
-    physics: list[int] = []  # the new variables u
-    builder = GroupBuilder()
-    names = list(variables.names)
-    known = variables.index if diagram.blocks else {}
+    for c in found:
+        for j, v in enumerate(c.targets):
+            corrections.setdefault(v, []).append(len(names))
+            provenance = Provenances.of([Provenance(f"output {j} of the network", c.opaque.name)])
+            columns = [(np.array([i]), 0) for i in c.inputs]
+            _add_opaque(builder, c.opaque, j, (np.array([len(names)]), 0), columns, provenance)
+            names.append(f"{c.opaque.name}[{j}]")
+    first = len(names)  # of the new variables u
+    physics = np.full(first, -1)
+    for v, ws in corrections.items():
+        physics[v] = u = len(names)
+        names.append(f"{names[v]}:physics")
+        terms = [(v, 1, 1.0), (u, 0, -1.0), *((w, 0, -1.0) for w in ws)]
+        builder.add_linear(terms, Provenance(f"corrected derivative of {names[v]}"))
+    redirected = []
+    for group in groups:
+        new = physics[group.variable]
+        hit = (new >= 0) & (group.order > 0)
+        variable, order = np.where(hit, new, group.variable), np.where(hit, group.order - 1, group.order)
+        redirected.append(dataclasses.replace(group, variable=variable, order=order))
+    return _extended(variables, names, first), (*redirected, *builder.groups()), rows
+
+
+def _corrections(
+    model: ModelNumbers, diagram: AcausalDiagram, variables: VariableTable, groups, networks: dict[str, Any]
+) -> list[_Correction]:
+    """The corrections of the diagram, whose functions are added to `networks`."""
+    names, known = variables.names, variables.index if diagram.blocks else {}
+    differentiated = np.zeros(len(names), bool)
+    for group in groups:
+        differentiated[group.variable[group.order > 0]] = True
 
     def find(reference, block, what: str) -> int:
         component, name = reference
@@ -79,9 +128,7 @@ def add_corrections(model: ModelNumbers, diagram: AcausalDiagram, variables: Var
             )
         return known[name]
 
-    differentiated = np.zeros(len(names), bool)
-    for group in groups:
-        differentiated[group.variable[group.order > 0]] = True
+    found = []
     for block in diagram.blocks.values():
         targets = tuple(find(t, block, "target") for t in block.targets)
         times = frozenset(k for k, (c, n) in enumerate(block.inputs) if c is None and n == "time")
@@ -96,52 +143,26 @@ def add_corrections(model: ModelNumbers, diagram: AcausalDiagram, variables: Var
                     "is no derivative to correct; targets can be "
                     + ", ".join(repr(names[k]) for k in np.flatnonzero(differentiated)[:8])
                 )
-        if block.inject == "row":
-            rows.append(RowInjection(opaque, targets, inputs))
-            continue
-        for j, v in enumerate(targets):
-            w = len(names)
-            names.append(f"{block.name}[{j}]")
-            corrections.setdefault(v, []).append(w)
-            provenance = Provenances.of([Provenance(f"output {j} of the network", block.name)])
-            columns = [(np.array([i]), 0) for i in inputs]
-            _add_opaque(builder, opaque, j, (np.array([w]), 0), columns, provenance)
-    if corrections:
-        target_index = np.full(len(names) + len(corrections), -1)
-        for v, ws in corrections.items():
-            u = len(names)
-            target_index[v] = u
-            names.append(f"{names[v]}:physics")
-            physics.append(u)
-            builder.add_linear(
-                [(v, 1, 1.0), (u, 0, -1.0), *((w, 0, -1.0) for w in ws)],
-                Provenance(f"corrected derivative of {names[v]}"),
-            )
-        redirected = []
-        for group in groups:
-            new = target_index[group.variable]
-            hit = (new >= 0) & (group.order > 0)
-            variable = np.where(hit, new, group.variable)
-            order = np.where(hit, group.order - 1, group.order)
-            redirected.append(dataclasses.replace(group, variable=variable, order=order))
-        groups = (*redirected, *builder.groups())
+        found.append(_Correction(opaque, targets, inputs, block.inject))
+    return found
+
+
+def _extended(variables: VariableTable, names: list[str], first_internal: int) -> VariableTable:
+    """The table with more variables, of which nothing is declared. Those from `first_internal` on are nobody's."""
     extra = len(names) - len(variables)
-    if extra:
-        variables = VariableTable(
-            names=names,
-            is_input=np.concatenate([variables.is_input, np.zeros(extra, bool)]),
-            is_port=np.concatenate([variables.is_port, np.zeros(extra, bool)]),
-            start=variables.start.padded(extra),
-            fixed=np.concatenate([variables.fixed, np.zeros(extra, bool)]),
-            nominal=np.concatenate([variables.nominal, np.zeros(extra)]),
-            bounds=np.concatenate([variables.bounds, np.tile([-np.inf, np.inf], (extra, 1))]),
-            unit=[*variables.unit, *[""] * extra],
-            default=[*variables.default, *[None] * extra],
-            owner=np.concatenate([variables.owner, np.full(extra, -1)]),
-            port=np.concatenate([variables.port, np.full(extra, -1)]),
-            is_across=np.concatenate([variables.is_across, np.zeros(extra, bool)]),
-            is_internal=np.concatenate(
-                [variables.is_internal, np.isin(np.arange(len(variables), len(names)), physics)]
-            ),
-        )
-    return variables, groups, tuple(rows)
+    no = np.zeros(extra, bool)
+    return VariableTable(
+        names=names,
+        is_input=np.append(variables.is_input, no),
+        is_port=np.append(variables.is_port, no),
+        start=variables.start.padded(extra),
+        fixed=np.append(variables.fixed, no),
+        nominal=np.append(variables.nominal, np.zeros(extra)),
+        bounds=np.concatenate([variables.bounds, np.tile([-np.inf, np.inf], (extra, 1))]),
+        unit=[*variables.unit, *[""] * extra],
+        default=[*variables.default, *[None] * extra],
+        owner=np.append(variables.owner, np.full(extra, -1)),
+        port=np.append(variables.port, np.full(extra, -1)),
+        is_across=np.append(variables.is_across, no),
+        is_internal=np.append(variables.is_internal, np.arange(len(variables), len(names)) >= first_internal),
+    )

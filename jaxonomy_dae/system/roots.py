@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from ..linear.dense import solve_dense
-from ..linear.newton import Tried
-from ..linear.newton import newton as search
+from ..linear.newton import Tried, newton
 from ..linear.written_out import UNROLLED, solve
 from ..tolerances import NOISE, ZERO_WITHIN, spacing
 
@@ -78,20 +77,15 @@ def find_root(
         falls = (largest <= (1 - part / 4) * least) | (least <= SURE)
         return Tried(falls, holds(z), step, largest)
 
-    found = search(look, z, jnp.full(batch, jnp.inf, z[0].dtype), NEWTON_STEPS, batch=batch)
+    found = newton(look, z, jnp.full(batch, jnp.inf, z[0].dtype), NEWTON_STEPS, batch=batch)
     z = jax.lax.stop_gradient(found.x)
     for _ in range(2):
         z = differentiable(z)
     return z, found.holds
 
 
-def newton(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> list[Any]:
-    """z after a Newton step for r(z) = 0, lists of arrays of one shape (a batch of problems); exact if r is affine."""
-    return [a + d for a, d in zip(z, newton_step(residuals, z)[1], strict=True)]
-
-
 def newton_step(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> tuple[list[Any], list[Any]]:
-    """(r(z), a Newton step)."""
+    """(r(z), a Newton step), for lists of arrays of one shape (a batch of problems); exact if r is affine."""
     m = len(z)
     if m <= UNROLLED:
         value, push = jax.linearize(residuals, z)

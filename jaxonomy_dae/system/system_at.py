@@ -34,7 +34,7 @@ from .evaluate import Evaluation
 from .input_values import input_values
 from .measured import Measured
 from .nonlinear import Refinement
-from .roots import newton
+from .roots import newton_step
 
 
 class SystemAt:
@@ -125,7 +125,7 @@ class SystemAt:
             return jax.jvp(self.carried_vector, (self.t, x), moved)[1]
 
         if plan.carried_pattern is None:
-            rates = newton(lambda rates: entries(along(jnp.stack(rates))), [jnp.zeros((), self.dtype)] * m)
+            _, rates = newton_step(lambda rates: entries(along(jnp.stack(rates))), [jnp.zeros((), self.dtype)] * m)
             return jnp.stack(rates)
         matrix = sparse_jacobian(lambda z: self.carried_vector(self.t, jnp.append(x[:n], z)), plan.carried_pattern)(
             x[n:]
