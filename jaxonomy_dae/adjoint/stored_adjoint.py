@@ -4,7 +4,7 @@ import contextlib
 import contextvars
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import diffrax
@@ -115,33 +115,6 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             forward, consts = by_itself_or_batched(*quick, forward, consts)
         stepper = _Solver(forward, consts, solver, terms)
 
-        def outer(cond_fun, body_fun, start, *, max_steps, buffers):
-            del cond_fun, buffers
-            start = _arrays(start)
-            buffers = tuple((save.ts, save.ys) for save in state_saves(start))
-
-            def body(state, buffers, active, first):
-                state = dataclasses.replace(
-                    state,
-                    controller_state=(state.controller_state[0], active),
-                    progress_meter_state=(state.progress_meter_state[0], first),
-                )
-                out = _arrays(body_fun(_with_buffers(state, buffers)))
-                saved = tuple((save.ts, save.ys) for save in state_saves(out))
-                return _without_buffers(out), saved, stepper.noted, stepper.taken
-
-            start = _without_buffers(start)
-            flag = jnp.array(True)
-            converted, consts = closure_convert(body, start, buffers, flag, flag)
-            program = SolveProgram(
-                **functions, body=converted, max_steps=max_steps, chunk=chunk, points=points,
-                precision=jax.config.jax_default_matmul_precision,  # pyright: ignore[reportAttributeAccessIssue]
-            )  # fmt: skip
-            given = dict(state=start, buffers=buffers, table=_arrays(empty), body=consts)
-            final, buffers, table = solve(numbers | given, program)
-            final = _with_buffers(final, buffers)
-            return dataclasses.replace(final, y=together(final.y, table))
-
         final_state, stats = private("loop")(
             **given
             | dict(
@@ -151,7 +124,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
                 init_state=state,
             ),
             inner_while_loop=_inner_loop,
-            outer_while_loop=outer,
+            outer_while_loop=_outer_loop(stepper, functions, numbers, empty, chunk, points),
         )
         final_state = dataclasses.replace(
             final_state,
@@ -196,6 +169,41 @@ def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
     """The loop that saves at times within a step, not differentiated by itself."""
     del checkpoints
     return private("while_loop")(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
+
+
+def _outer_loop(
+    stepper: "_Solver", functions: dict[str, Any], numbers: dict[str, Any], empty: PyTree, chunk: int, points: int
+) -> Callable[..., Any]:
+    """The loop over the steps: `solve`, given the body of Diffrax' loop as a function that closes over nothing."""
+
+    def outer(cond_fun, body_fun, start, *, max_steps, buffers):
+        del cond_fun, buffers
+        start = _arrays(start)
+        buffers = tuple((save.ts, save.ys) for save in state_saves(start))
+
+        def body(state, buffers, active, first):
+            state = dataclasses.replace(
+                state,
+                controller_state=(state.controller_state[0], active),
+                progress_meter_state=(state.progress_meter_state[0], first),
+            )
+            out = _arrays(body_fun(_with_buffers(state, buffers)))
+            saved = tuple((save.ts, save.ys) for save in state_saves(out))
+            return _without_buffers(out), saved, stepper.noted, stepper.taken
+
+        start = _without_buffers(start)
+        flag = jnp.array(True)
+        converted, consts = closure_convert(body, start, buffers, flag, flag)
+        program = SolveProgram(
+            **functions, body=converted, max_steps=max_steps, chunk=chunk, points=points,
+            precision=jax.config.jax_default_matmul_precision,  # pyright: ignore[reportAttributeAccessIssue]
+        )  # fmt: skip
+        given = dict(state=start, buffers=buffers, table=_arrays(empty), body=consts)
+        final, buffers, table = solve(numbers | given, program)
+        final = _with_buffers(final, buffers)
+        return dataclasses.replace(final, y=together(final.y, table))
+
+    return outer
 
 
 def _functions(
