@@ -12,6 +12,7 @@ from scipy.linalg.blas import get_blas_funcs
 
 _S = TypeVar("_S")
 Numbers = jax.Array | np.ndarray
+Scalar = float | jax.Array  # a number that is known while a program is traced, or an array
 Verdict = Numbers | np.bool_  # true or false
 
 

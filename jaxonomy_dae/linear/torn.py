@@ -35,6 +35,7 @@ import numpy as np
 from ..structure.tearing import Tearing
 from ..tolerances import TOLERATED, TOLERATED_NORM
 from . import dense
+from .arrays import Scalar
 from .inverse import FORMULA, inverse
 from .once import once
 from .written_out import UNROLLED
@@ -42,11 +43,10 @@ from .written_out import UNROLLED
 APART = 8  # equations of a block from which on what its phases hand on is computed once, and not where it is read
 CORRECTIONS = 2  # where an unknown of the sequence depends on another; else one is enough
 
-Scalar = float | jax.Array  # a number that is known, or an array of the shape of the right-hand side
 Entries = Mapping[tuple[int, int], Scalar]
 
 
-def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[Scalar]) -> list[Scalar]:
+def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[jax.Array]) -> list[jax.Array]:
     """x with A·x = b.
 
     **Arguments:**
@@ -193,7 +193,7 @@ class _Elimination:
         solve = dense.transpose_solve if transposed else dense.solve
         return list(jnp.moveaxis(solve(self.factors, jnp.moveaxis(jnp.stack(s), 0, -1)[..., None])[..., 0], -1, 0))
 
-    def solve(self, b: Sequence[Scalar]) -> list[Scalar]:
+    def solve(self, b: Sequence[Scalar]) -> list[Any]:
         """A⁻¹ b."""
         tearing = self.tearing
         b = self._right(b)

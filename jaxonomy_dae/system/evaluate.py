@@ -11,7 +11,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from ..aliases import Time
+from ..linear.arrays import Scalar
 from ..linear.torn import solve_torn
 from ..linear.whole import solve_whole
 from ..lowering.gather import Chunk, Gather
@@ -28,18 +31,20 @@ class Linear(NamedTuple):
     """The linear blocks of one step."""
 
     planned: PlannedStep | PlannedSparse
-    rows: Sequence[Any]  # of each equation in one block, a number, or an array if its instances have different ones
-    right: list[Any]
-    solve: Callable[[list[Any], bool], list[Any]]  # the unknowns for a right-hand side, which is checked or not
-    at: Callable[[list[Any]], Inside]  # where equations are evaluated, given the unknowns
+    rows: Sequence[
+        int | np.ndarray
+    ]  # of each equation in one block, a number, or an array if its instances have different ones
+    right: list[Array]
+    solve: Callable[[list[Array], bool], list[Array]]  # the unknowns for a right-hand side, which is checked or not
+    at: Callable[[list[Array]], Inside]  # where equations are evaluated, given the unknowns
 
 
 class Evaluation(Values):
     """One pass over a program's steps at one point."""
 
-    def __init__(self, state: Chunk, inputs: Chunk, parameters: Any, t: Any, networks: Networks, typical: Any):
+    def __init__(self, state: Chunk, inputs: Chunk, parameters: Array, t: Time, networks: Networks, typical: Array):
         super().__init__([state, inputs], parameters, t, networks, typical)
-        self.residuals: list[Any] = []  # of nonlinear blocks, if nothing is refined
+        self.residuals: list[Array] = []  # of nonlinear blocks, if nothing is refined
 
     def run(self, program: Program, refine: Refinement):
         """Evaluates all steps."""
@@ -47,18 +52,18 @@ class Evaluation(Values):
             self.chunks.extend(self._computed(planned, refine))
         return self
 
-    def _computed(self, planned: Planned, refine: Refinement) -> list[Any]:
+    def _computed(self, planned: Planned, refine: Refinement) -> list[Array]:
         """The chunks of a step: one for each local unknown, of a sparse step one for all."""
         if isinstance(planned, PlannedLoop):
             return self.loop(planned)
         return self._whole(planned, refine) if isinstance(planned, PlannedSparse) else self.step(planned, refine)
 
-    def step(self, planned: PlannedStep, refine: Refinement) -> list[Any]:
+    def step(self, planned: PlannedStep, refine: Refinement) -> list[Array]:
         if planned.step.carried:
             return self.nonlinear(WrittenOut(self, planned), refine)
         if not planned.step.tearing.tearing:
             return self.follow(planned, ())
-        matrix: dict[tuple[int, int], Any] = {}
+        matrix: dict[tuple[int, int], Scalar] = {}
         right = []
         shape = () if planned.step.n == 1 else (planned.step.n,)
         blank = [0.0] * len(planned.step.unknown)
@@ -68,26 +73,26 @@ class Evaluation(Values):
             for u, slope in slopes:
                 matrix[e, u] = matrix[e, u] + slope if (e, u) in matrix else slope
 
-        def solve(right: list[Any], checked: bool) -> list[Any]:
+        def solve(right: list[Array], checked: bool) -> list[Array]:
             return solve_torn(planned.step.tearing, matrix, right)
 
         rows = range(len(planned.equations))
         return self.linear(Linear(planned, rows, right, solve, lambda unknowns: Inside(self, unknowns, unknowns)))
 
-    def _whole(self, planned: PlannedSparse, refine: Refinement) -> list[Any]:
+    def _whole(self, planned: PlannedSparse, refine: Refinement) -> list[Array]:
         whole = Whole(self, planned)
         if planned.guess is not None:
             return self.nonlinear(whole, refine)
         residual, matrix = self.whole_system(planned, jnp.zeros(planned.step.n, self.dtype))
 
-        def solve(right: list[Any], checked: bool) -> list[Any]:
+        def solve(right: list[Array], checked: bool) -> list[Array]:
             given = jnp.concatenate([jnp.reshape(r, (-1,)) for r in right])
             return [solve_whole(planned.pattern, matrix, given, checked=checked, solver=planned.linear_solver)]
 
         ends = np.cumsum([len(e.equation) for e in planned.equations])
         return self.linear(Linear(planned, np.split(np.arange(ends[-1]), ends[:-1]), [-residual], solve, whole.at))
 
-    def nonlinear(self, block: AbstractBlock, refine: Refinement) -> list[Any]:
+    def nonlinear(self, block: AbstractBlock, refine: Refinement) -> list[Array]:
         """The unknowns of nonlinear blocks."""
         if refine is not Refinement.NONE:
             return block.unknowns(refine)
@@ -95,14 +100,14 @@ class Evaluation(Values):
         self.residuals.extend(block.residuals(inside))
         return inside.chunks
 
-    def linear(self, block: Linear) -> list[Any]:
+    def linear(self, block: Linear) -> list[Array]:
         """The unknowns of linear blocks."""
         return block.solve(block.right, True)
 
-    def loop(self, planned: PlannedLoop) -> list[Any]:
+    def loop(self, planned: PlannedLoop) -> list[Array]:
         """The unknowns of all repetitions, each of shape (count · n,)."""
 
-        def read(gather: Gather | None) -> Any:
+        def read(gather: Gather | None) -> Array:
             if gather is None:
                 return jnp.zeros(0, self.dtype)
             return filled(self.read(gather), (len(gather.chunk),), self.dtype)
@@ -122,7 +127,7 @@ class Evaluation(Values):
         _, chunks = jax.lax.scan(repetition, read(planned.first), given, unroll=UNROLLED_REPETITIONS)
         return [jnp.reshape(c, (-1,)) for c in chunks]
 
-    def _affine_parts(self, planned: PlannedEquation, blank: list[Any]) -> tuple[Any, list[tuple[int, Any]]]:
+    def _affine_parts(self, planned: PlannedEquation, blank: list[float]) -> tuple[Any, list[tuple[int, Scalar]]]:
         """The residual where all local unknowns are zero, and its slopes as (local unknown, slope)."""
         group = planned.equation
         inside = group.inside
@@ -142,5 +147,5 @@ class Evaluation(Values):
             partials = {inside[0]: partials[0]} if group.template.opaque is not None else partials
         return rest, [(group.local[k], scaled_by(planned.factors[k], partials[k], self.dtype)) for k in inside]
 
-    def _constant(self, value: Any) -> Any:
+    def _constant(self, value: Scalar) -> Scalar:
         return value if isinstance(value, float) else jnp.asarray(value, self.dtype)

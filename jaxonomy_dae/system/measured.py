@@ -11,7 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from ..aliases import Time
+from ..linear.arrays import Scalar
 from ..lowering.gather import Chunk, Gather
 from ..lowering.program import PlannedLoop, PlannedSparse, PlannedStep
 from ..model.opaque import Networks
@@ -25,19 +28,19 @@ class Measured(Evaluation):
     a chunk for each of `chunks`."""
 
     def __init__(
-        self, state: Chunk, sizes: Chunk, inputs: Chunk, parameters: Any, t: Any, networks: Networks, typical: Any
+        self, state: Chunk, sizes: Chunk, inputs: Chunk, parameters: Array, t: Time, networks: Networks, typical: Array
     ):
         """`sizes` are the magnitudes of the state's entries."""
         state, sizes, inputs, parameters, t, weights = still((state, sizes, inputs, parameters, t, networks.weights))
         super().__init__(state, inputs, parameters, t, Networks(weights), typical)
         self.magnitudes: list[Chunk] = [sizes, jax.tree.map(jnp.abs, inputs)]
-        self.carried_magnitudes: list[Any] = []
+        self.carried_magnitudes: list[Array] = []
 
-    def size(self, gather: Gather) -> Any:
+    def size(self, gather: Gather) -> Array:
         """The magnitudes of gathered values: a scalar, or an array."""
         return Gather(gather.chunk, gather.offset, np.abs(gather.factor)).read(self.magnitudes, self.dtype)
 
-    def terms_of(self, at: EquationAt, sizes: Sequence[Any] = ()) -> Any:
+    def terms_of(self, at: EquationAt, sizes: Sequence[Scalar] = ()) -> Array:
         """The magnitude of an equation, given those of local unknowns."""
         pairs = zip(at.planned.sources, at.planned.factors, strict=True)
         of_slots = [
@@ -45,10 +48,10 @@ class Measured(Evaluation):
         ]
         return at.filled(at.magnitude(of_slots))
 
-    def follow(self, planned: PlannedStep, z: Sequence[Any]) -> list[Any]:
+    def follow(self, planned: PlannedStep, z: Sequence[Scalar]) -> list[Array]:
         local = super().follow(planned, z)
 
-        def of_rest(at: EquationAt, partials: Sequence[Any], sizes: list[Any], unknown: int) -> Any:
+        def of_rest(at: EquationAt, partials: Sequence[Scalar], sizes: list[Scalar], unknown: int) -> Scalar:
             return self.terms_of(at, [0.0 if u == unknown else size for u, size in enumerate(sizes)])
 
         sizes: list[Any] = [None] * len(local)
@@ -57,7 +60,7 @@ class Measured(Evaluation):
         self.magnitudes.extend(self.through(planned, local, sizes, of_rest))
         return local
 
-    def nonlinear(self, block: AbstractBlock, refine: Refinement) -> list[Any]:
+    def nonlinear(self, block: AbstractBlock, refine: Refinement) -> list[Array]:
         if isinstance(block.planned, PlannedSparse):
             assert block.planned.guess is not None
             self.magnitudes.append(self.size(block.planned.guess))
@@ -66,7 +69,7 @@ class Measured(Evaluation):
         self.carried_magnitudes.extend(self.terms_of(at, sizes) for at in block.equations(inside, still=False))
         return inside.chunks
 
-    def linear(self, block: Linear) -> list[Any]:
+    def linear(self, block: Linear) -> list[Array]:
         unknowns = super().linear(block)
         values, local, _ = block.at(unknowns)
         known = [jnp.abs(u) for u in unknowns]
@@ -78,12 +81,12 @@ class Measured(Evaluation):
         self.magnitudes[first:] = [jnp.maximum(jnp.abs(f), k) for f, k in zip(found, known, strict=True)]
         return unknowns
 
-    def loop(self, planned: PlannedLoop) -> list[Any]:
+    def loop(self, planned: PlannedLoop) -> list[Array]:
         chunks = super().loop(planned)
         self.magnitudes.extend(jnp.full_like(c, jnp.inf) for c in chunks)
         return chunks
 
 
-def _signs(rows: Any) -> Any:
+def _signs(rows: int | np.ndarray) -> np.ndarray:
     """Signs without a pattern, the parities of the golden ratio's multiples."""
     return 1.0 - 2.0 * (np.floor(np.asarray(rows) * 1.618033988749895) % 2)

@@ -11,11 +11,13 @@ import abc
 import enum
 import functools
 from collections.abc import Sequence
-from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
+from typing import ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
+from ..linear.arrays import Scalar
 from ..linear.whole import solve_whole
 from ..lowering.program import PlannedSparse, PlannedStep
 from ..tolerances import solved, spacing
@@ -38,8 +40,8 @@ class Inside(NamedTuple):
     """Where the equations of a block are evaluated, and all unknowns of the step, a chunk each."""
 
     values: Values
-    local: Sequence[Any]
-    chunks: list[Any]
+    local: Sequence[Scalar]
+    chunks: list[Array]
 
 
 class AbstractBlock(abc.ABC, Generic[_P]):
@@ -60,18 +62,18 @@ class AbstractBlock(abc.ABC, Generic[_P]):
 
     @property
     @abc.abstractmethod
-    def guess(self) -> list[Any]:
+    def guess(self) -> list[Array]:
         """The unknowns in the state array."""
 
     @abc.abstractmethod
-    def at(self, z: list[Any]) -> Inside:
+    def at(self, z: list[Array]) -> Inside:
         """The place where the unknowns are z."""
 
     @abc.abstractmethod
-    def step(self, z: list[Any]) -> tuple[list[Any], list[Any]]:
+    def step(self, z: list[Array]) -> tuple[list[Array], list[Array]]:
         """The residuals, and a Newton step."""
 
-    def noise(self, inside: Inside) -> list[Any]:
+    def noise(self, inside: Inside) -> list[Scalar]:
         """Bounds of the rounding errors of the local unknowns that follow from others."""
         return []
 
@@ -80,20 +82,20 @@ class AbstractBlock(abc.ABC, Generic[_P]):
         at = inside.values.still_equation if still else inside.values.equation
         return [at(equation, inside.local) for equation in self.planned.left]
 
-    def residuals(self, inside: Inside) -> list[Any]:
+    def residuals(self, inside: Inside) -> list[Array]:
         """The residuals of these equations."""
         return [at.filled(at.residual()) for at in self.equations(inside, still=False)]
 
-    def magnitudes(self, inside: Inside) -> list[Any]:
+    def magnitudes(self, inside: Inside) -> list[Array]:
         """The magnitudes of their terms, as residuals are given by `step`."""
         found = [at.filled(at.magnitude()) for at in self.equations(inside, still=True)]
         return [jnp.concatenate([jnp.reshape(f, (-1,)) for f in found])] if self.whole else found
 
-    def corrected(self, z: list[Any]) -> list[Any]:
+    def corrected(self, z: list[Array]) -> list[Array]:
         """The unknowns after one Newton step, which is exact if the equations are affine."""
         return [a + d for a, d in zip(z, self.step(z)[1], strict=True)]
 
-    def holds(self, inside: Inside, tolerated: float) -> Any:
+    def holds(self, inside: Inside, tolerated: float) -> Array:
         """True where the equations hold, for each of the blocks or for all."""
         verdicts, noise = [], self.noise(inside)
         for at in self.equations(inside, still=True):
@@ -102,7 +104,7 @@ class AbstractBlock(abc.ABC, Generic[_P]):
             verdicts.append(jnp.all(verdict) if self.whole else verdict)
         return functools.reduce(jnp.logical_and, verdicts)
 
-    def unknowns(self, refine: Refinement) -> list[Any]:
+    def unknowns(self, refine: Refinement) -> list[Array]:
         """The chunks of the step; not-a-number where equations do not hold."""
         z = self.guess
         if refine is Refinement.ONCE:
@@ -126,24 +128,24 @@ class WrittenOut(AbstractBlock[PlannedStep]):
     whole = False
 
     @property
-    def guess(self) -> list[Any]:
+    def guess(self) -> list[Array]:
         n = self.planned.step.n
         shape = () if n == 1 else (n,)
         return [filled(self.values.read(gather), shape, self.dtype) for gather in self.planned.guess]
 
-    def at(self, z: list[Any]) -> Inside:
+    def at(self, z: list[Array]) -> Inside:
         local = self.values.follow(self.planned, z)
         return Inside(self.values, local, local)
 
-    def step(self, z: list[Any]) -> tuple[list[Any], list[Any]]:
+    def step(self, z: list[Array]) -> tuple[list[Array], list[Array]]:
         return newton_step(lambda z: self.residuals(self.at(z)), z)
 
-    def noise(self, inside: Inside) -> list[Any]:
+    def noise(self, inside: Inside) -> list[Scalar]:
         """A running error analysis (Wilkinson 1963): a difference of pressures is not known to its own digits, but to
         theirs."""
         eps = spacing(self.dtype)
 
-        def of_rest(at: EquationAt, partials: Sequence[Any], noise: list[Any], unknown: int) -> Any:
+        def of_rest(at: EquationAt, partials: Sequence[Scalar], noise: list[Scalar], unknown: int) -> Scalar:
             total = eps * at.magnitude()
             rows = zip(at.planned.equation.local, at.slots, partials, at.of_slots(noise), strict=False)
             for place, s, p, n in rows:
@@ -160,14 +162,14 @@ class Whole(AbstractBlock[PlannedSparse]):
     whole = True
 
     @property
-    def guess(self) -> list[Any]:
+    def guess(self) -> list[Array]:
         assert self.planned.guess is not None
         return [self.values.read(self.planned.guess)]
 
-    def at(self, z: list[Any]) -> Inside:
+    def at(self, z: list[Array]) -> Inside:
         return Inside(self.values.beside(z[0]), (), z)
 
-    def step(self, z: list[Any]) -> tuple[list[Any], list[Any]]:
+    def step(self, z: list[Array]) -> tuple[list[Array], list[Array]]:
         residual, matrix = self.values.whole_system(self.planned, z[0])
         step = solve_whole(self.planned.pattern, matrix, residual, checked=False, solver=self.planned.linear_solver)
         return [residual], [-step]

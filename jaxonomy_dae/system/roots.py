@@ -1,13 +1,13 @@
 """Newton's method for batches of small systems, and the verdict that ends it."""
 
 import functools
-import operator
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
+from ..linear.arrays import Scalar
 from ..linear.dense import solve_dense
 from ..linear.newton import Tried, newton
 from ..linear.written_out import UNROLLED, solve
@@ -18,13 +18,13 @@ SURE = 1e-6  # residuals so small, relative to their terms at the start, need no
 
 
 def is_small(
-    residual: Any,
-    terms: Any,
-    partials: Sequence[Any],
-    typical: Sequence[Any],
+    residual: Array,
+    terms: Array,
+    partials: Sequence[Scalar],
+    typical: Sequence[Scalar],
     tolerated: float,
-    noise: Sequence[Any] = (),
-) -> Any:
+    noise: Sequence[Scalar] = (),
+) -> Array:
     """True if a residual is small beside its terms, or beside the rounding of what it is computed from.
 
     **Arguments:**
@@ -42,24 +42,24 @@ def is_small(
     return (jnp.abs(residual) <= allowed) & ((allowed < jnp.inf) | (residual == 0))
 
 
-def _weighed(pairs: Sequence[tuple[Any, Any]]) -> Any:
+def _weighed(pairs: Sequence[tuple[Scalar, Scalar]]) -> Scalar:
     """Σ |a|·b."""
-    return functools.reduce(operator.add, [abs(a) * b for a, b in pairs], 0.0)
+    return sum((abs(a) * b for a, b in pairs), 0.0)
 
 
-def _is_nothing(value: Any) -> bool:
+def _is_nothing(value: Scalar) -> bool:
     """True if a value is the Python number 0.0, known while a program is traced."""
     return isinstance(value, float) and value == 0.0
 
 
 def find_root(
-    holds: Callable[[list[Any]], Any],
-    stepped: Callable[[list[Any]], tuple[list[Any], list[Any]]],
-    differentiable: Callable[[list[Any]], list[Any]],
-    sizes: list[Any],
-    z: list[Any],
+    holds: Callable[[list[Array]], Array],
+    stepped: Callable[[list[Array]], tuple[list[Array], list[Array]]],
+    differentiable: Callable[[list[Array]], list[Array]],
+    sizes: list[Array],
+    z: list[Array],
     batch: tuple[int, ...],
-) -> tuple[list[Any], Any]:
+) -> tuple[list[Array], Array]:
     """Newton's method from z until all `holds`, one verdict for each of a batch of problems; and the verdicts.
 
     `stepped` gives the residuals and the step. A step is halved until the largest residual falls, relative to the
@@ -81,10 +81,10 @@ def find_root(
     z = jax.lax.stop_gradient(found.x)
     for _ in range(2):
         z = differentiable(z)
-    return z, found.holds
+    return z, jnp.asarray(found.holds)
 
 
-def newton_step(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> tuple[list[Any], list[Any]]:
+def newton_step(residuals: Callable[[list[Array]], list[Array]], z: list[Array]) -> tuple[list[Array], list[Array]]:
     """(r(z), a Newton step), for lists of arrays of one shape (a batch of problems); exact if r is affine."""
     m = len(z)
     if m <= UNROLLED:
