@@ -12,7 +12,8 @@ These things are relied on that have no name of their own, or one that is public
 - the wrapper that Diffrax puts around a term to turn time around: `unwrapped` and `rewrapped`;
 - that Diffrax fills the controller's tolerances into the root finder of a solver, be it wrapped: `FROM_CONTROLLER`;
 - that Diffrax lengthens a step to the end of the interval from 100 floating-point numbers before it: `clip_floor`;
-- the classes `JVPTracer` and `LinearizeTracer` of JAX by name, and what tracers wrap: `programs/staging.py`;
+- the classes `JVPTracer` and `LinearizeTracer` of JAX by name, what tracers wrap, and the attribute `is_vjp` of the
+  trace of the latter: `programs/staging.py`;
 - the attribute `_cached` of what `equinox.filter_jit` returns, the `jax.jit` inside: `clear_jitted`;
 - the attribute `_consts` of a function that `jax.jit` has traced, the values that it closes over: `constants`;
 - that XLA for CPUs does not take a call apart that is marked `inlineable="false"`: `linear/once.py`.

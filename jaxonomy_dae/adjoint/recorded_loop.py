@@ -9,7 +9,7 @@ from jax import lax
 
 from ..aliases import PyTree
 from ..private_names import private
-from ..programs.whole_records import RECORDS_ARE_WHOLE, flag
+from ..programs.whole_records import SET, flag, is_known_to_be_whole
 from .appended import appended
 from .closure_conversion import SolveProgram, any_member, apart, going, read, rows, unless_waiting, written
 from .packing import Packing
@@ -189,8 +189,8 @@ def _backwards(residuals, cotangents, perturbed, numbers, program):
         return q - 1, record, filled, over(record, filled, packed)
 
     packed = packing.pack(start)
-    if RECORDS_ARE_WHOLE.value:
-        wrong = is_whole != 1  # whoever said so was mistaken
+    if is_known_to_be_whole(is_whole):
+        wrong = jnp.any(is_whole != SET)  # whoever said so was mistaken
         packed = over(record, filled, jax.tree.map(lambda leaf: _refused(wrong, leaf), packed))
     else:
         loop = (chunks - 1, record, filled, packed)

@@ -52,12 +52,23 @@ def joined(parts: Sequence[Numeric]) -> Numeric:
 
 
 def is_forwards(tree: PyTree) -> bool:
-    """True if `jax.jvp` or `jax.jacfwd` is at work on a leaf, and no reverse mode.
+    """True if `jax.jvp`, `jax.jacfwd` or `jax.linearize` is at work on a leaf, and no reverse mode.
 
     `jax.jit(jax.jacfwd(f))` is known for what it is; inside `jax.jacfwd(jax.jit(f))` it cannot be seen.
     """
-    kinds = [{type(layer).__name__ for layer in layers(leaf)} for leaf in jax.tree.leaves(tree)]
-    return any("JVPTracer" in found for found in kinds) and not any("LinearizeTracer" in found for found in kinds)
+    kinds = {kind(layer) for leaf in jax.tree.leaves(tree) for layer in layers(leaf)}
+    return not kinds.isdisjoint({"JVPTracer", LINEARIZED}) and "LinearizeTracer" not in kinds
+
+
+LINEARIZED = "jax.linearize"
+
+
+def kind(layer: Any) -> str:
+    """The class of a tracer; `LINEARIZED` for one of `jax.linearize`, whose result is evaluated forwards, though it is
+    of the class that reverse mode has, too."""
+    name = type(layer).__name__
+    is_reverse = getattr(getattr(layer, "_trace", None), "is_vjp", True)
+    return LINEARIZED if name == "LinearizeTracer" and not is_reverse else name
 
 
 def layers(leaf: PyTree) -> Iterator[Any]:

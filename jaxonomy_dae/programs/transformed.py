@@ -20,9 +20,9 @@ from jax.custom_derivatives import SymbolicZero
 
 from ..aliases import PyTree
 from ..private_names import MissingName, clear_jitted, private
-from .staging import is_staged, is_traced, layers
+from .staging import is_staged, is_traced, kind, layers
 from .tiers import Program
-from .whole_records import RECORDS_ARE_WHOLE, are_whole
+from .whole_records import WHOLE, numbered, whole_records
 
 
 class Function:
@@ -54,14 +54,14 @@ class Function:
 
     def __call__(self, arrays: list[Any]) -> PyTree:
         arrays = [a if isinstance(a, jax.Array) else jax.device_put(a) for a in arrays]  # JAX' own kind of float
-        kind = _at_work(arrays)
-        if kind == "LinearizeTracer":
+        work = _at_work(arrays)
+        if work == "LinearizeTracer":
             return self._differentiated(arrays)
-        if kind == "JVPTracer":
+        if work == "JVPTracer":
             return self._pushed(arrays)
-        if kind == "BatchTracer":
+        if work == "BatchTracer":
             return self._batched(arrays)
-        if kind or not _is_plain(arrays):
+        if work or not _is_plain(arrays):
             return self._transformed(arrays)
         if self._program is None:
             self._program = Program(self.function, arrays, self.name, self.why, self.runs_once, self.identity)
@@ -135,10 +135,10 @@ class Function:
             read = tuple(not isinstance(c, SymbolicZero) for c in cotangents)
             leaves, structure = residuals.leaves, residuals.structure
             n = len(leaves)
-            whole = not is_traced(leaves) and are_whole(leaves)
+            whole = () if is_traced(leaves) else whole_records(leaves)
 
             def pulled(arrays: list[Array]) -> list[PyTree]:
-                with RECORDS_ARE_WHOLE(whole):
+                with WHOLE(whole):
                     return pulled_back(arrays)
 
             def pulled_back(arrays: list[Array]) -> list[PyTree]:
@@ -290,7 +290,8 @@ def _values(function: Callable[[list[PyTree]], PyTree], chosen: tuple[int, ...],
         return jax.tree.leaves(smooth), others
 
     shape: list[PyTree] = []
-    smooth, pullback, others = jax.vjp(of, *(arrays[k] for k in chosen), has_aux=True)
+    with numbered():
+        smooth, pullback, others = jax.vjp(of, *(arrays[k] for k in chosen), has_aux=True)
     structure, fixed = shape
     leaves, of_pullback = jax.tree.flatten(pullback)
     return smooth, (_Static(structure), eqx.combine(others, fixed)), _Pullback(leaves, _Structure(of_pullback))
@@ -316,7 +317,7 @@ def _at_work(arrays: list[Array]) -> str:
         return ""
     if is_staged(arrays):
         return "other"
-    kinds = [tuple(type(layer).__name__ for layer in layers(a))[:-1] for a in arrays]
+    kinds = [tuple(map(kind, layers(a)))[:-1] for a in arrays]
     deepest = max(kinds, key=len)
     # All others must be wrapped by the same, or by what it wraps.
     if any(kind != deepest[len(deepest) - len(kind) :] and kind[:1] != deepest[:1] for kind in kinds):

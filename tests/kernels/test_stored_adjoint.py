@@ -14,6 +14,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
+from jaxonomy_dae.programs.cache import compiled
 from jaxonomy_dae.solvers import BDF, DAETerm, StoredAdjoint, Tsit5, solve_dae
 
 STORED, RECURSIVE = StoredAdjoint(), diffrax.RecursiveCheckpointAdjoint()
@@ -346,3 +347,19 @@ def test_without_rank_promotion():
 
     with jax.numpy_rank_promotion("raise"):
         assert jax.jit(jax.grad(final))(0.7) == pytest.approx(-np.exp(-0.7), rel=1e-4)
+
+
+@pytest.mark.long("a gradient of two solves")
+def test_a_record_that_is_whole_says_nothing_of_another_one():
+    """Of two solves in one program, the second has more steps than its record has room for. Inside of `jax.checkpoint`
+    it hands on nothing: the first one's record counted for it, and the gradient was not a number."""
+
+    def decayed(k, steps):
+        term, step = diffrax.ODETerm(lambda t, y, k: -k * y), 1.0 / steps
+        return diffrax.diffeqsolve(
+            term, Tsit5(), 0.0, 1.0, step, jnp.ones(1), k, adjoint=STORED, max_steps=1000, throw=False
+        ).ys[-1, 0]  # fmt: skip
+
+    run = compiled(lambda k: decayed(k, 5) + jax.checkpoint(lambda k: decayed(2 * k, 400))(k))
+    expected = -np.exp(-0.7) - 2 * np.exp(-1.4)
+    assert float(jax.grad(run)(jnp.asarray(0.7))) == pytest.approx(expected, rel=1e-5)

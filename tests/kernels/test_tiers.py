@@ -235,6 +235,7 @@ TRANSFORMED = {
     "forward in a batch": lambda f, x, k, ks: jax.vmap(jax.jacfwd(f), (None, 0))(x, ks),
     "forward of a batch": lambda f, x, k, ks: jax.jvp(lambda ks: jax.vmap(f, (None, 0))(x, ks), (ks,), (ks,)),
     "forward twice": lambda f, x, k, ks: jax.jacfwd(jax.jacfwd(f))(x, k),
+    "linearized": lambda f, x, k, ks: jax.linearize(lambda k: f(x, k), k)[1](jnp.ones_like(k)),
     "second derivative": lambda f, x, k, ks: jax.grad(jax.grad(lambda k: f(x, k)))(k),
     "forward over reverse": lambda f, x, k, ks: jax.jacfwd(jax.grad(lambda k: f(x, k)))(k),
     "jacobian": lambda f, x, k, ks: jax.jacrev(lambda x: f(x, k))(x),
