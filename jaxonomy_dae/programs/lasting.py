@@ -13,6 +13,7 @@ import hashlib
 import importlib.metadata
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -23,6 +24,7 @@ from jax import Array
 from jax.tree_util import PyTreeDef
 
 PACKAGE = __name__.partition(".")[0]
+_IMPORTED = time.time()
 # Functions and classes of these are told by their names, for their versions are told, too.
 LIBRARIES = ("jax", "jaxlib", "numpy", "scipy", "sympy", "equinox", "diffrax", "lineax", "optimistix", "klujax")
 _PLAIN = frozenset({type(None), bool, int, float, complex, str, bytes})  # whose `repr` says all
@@ -122,10 +124,17 @@ def _reached(module: Any, path: str) -> object:
 
 @functools.cache
 def _code() -> str:
-    """The code of this package, file by file, and the versions of the libraries."""
+    """The code of this package, file by file, and the versions of the libraries.
+
+    **Raises:**
+
+    - `NotLasting` if a file has changed since this process read it: its programs are those of the code before.
+    """
     found = hashlib.sha256()
     root = Path(__file__).parent.parent
     for path in sorted(root.rglob("*.py")):
+        if path.stat().st_mtime > _IMPORTED:
+            raise NotLasting
         found.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     versions = [(name, _version(name)) for name in LIBRARIES]
     return f"{found.hexdigest()} {versions} {sys.version}"

@@ -69,6 +69,17 @@ def test_a_call_is_not_traced_again(folder):
         np.testing.assert_array_equal(first[name], second[name])
 
 
+def test_code_that_has_changed_since_it_was_read(monkeypatch):
+    """A developer edits a file of the package while a notebook runs: programs of the code before are not kept as those
+    of the code after."""
+    lasting._code.cache_clear()
+    assert lasting.lasting(1) is not None
+    lasting._code.cache_clear()
+    monkeypatch.setattr(lasting, "_IMPORTED", 0.0)
+    assert lasting.lasting(1) is None
+    lasting._code.cache_clear()
+
+
 DERIVATIVES = {
     "reverse": lambda f, k: jax.grad(f)(k),
     "forward": lambda f, k: jax.jacfwd(f)(k),
