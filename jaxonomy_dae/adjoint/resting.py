@@ -89,16 +89,9 @@ class Resting(eqx.Module):
         state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         no, none = jnp.array(False), jnp.zeros(x.shape, bool)
         return Pushed(
-            y=x,
-            solver_state=state,
-            fresh=no,
-            exists=no,
-            resting=none,
-            given_up=no,
-            next_y=x,
-            next_state=state,
+            y=x, solver_state=state, fresh=no, exists=no, resting=none, given_up=no, next_y=x, next_state=state,
             allowed=jnp.full_like(jnp.asarray(t), jnp.inf),
-        )
+        )  # fmt: skip
 
     def first_end(self, t: Time, end: Time, y: State) -> Time:
         """The end of the first step, made earlier where a component rests. A second run begins after a step only, so
@@ -187,16 +180,9 @@ class Resting(eqx.Module):
         resting = jnp.where(new | again, rests, still_resting)
         given_up = pushed.given_up | (look & ~done)
         after = Pushed(
-            y=y,
-            solver_state=state,
-            fresh=fresh,
-            exists=exists,
-            resting=resting,
-            given_up=given_up,
-            next_y=next_y,
-            next_state=next_state,
-            allowed=allowed,
-        )
+            y=y, solver_state=state, fresh=fresh, exists=exists, resting=resting, given_up=given_up, next_y=next_y,
+            next_state=next_state, allowed=allowed,
+        )  # fmt: skip
         after = jax.tree.map(lambda a, b: jnp.where(exists, a, b), after, without)
         after = eqx.tree_at(lambda p: p.given_up, after, given_up)
         return jnp.where(exists, end, step.end), after
@@ -234,15 +220,9 @@ def held_back(
         return new, jnp.array(False), pushed
     jump = new.made_jump if program.jumps else False  # some versions of JAX make an array of a constant
     step = AttemptedStep(
-        t0=state.tprev,
-        t1=state.tnext,
-        y0=state.y,
-        y1=new.y,
-        accepted=accepted,
-        jump=jump,
-        start=new.tprev,
+        t0=state.tprev, t1=state.tnext, y0=state.y, y1=new.y, accepted=accepted, jump=jump, start=new.tprev,
         end=new.tnext,
-    )
+    )  # fmt: skip
     end, pushed = program.rest(numbers["rest"], step, pushed)
     return dataclasses.replace(new, tnext=end), end < new.tnext, pushed
 

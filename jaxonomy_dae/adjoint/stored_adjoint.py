@@ -253,15 +253,9 @@ def _functions(
         pushed = resting.begin(s.tprev, s.y)
         first = closure_convert(lambda *given: (resting.first_end(*given),), s.tprev, s.tnext, s.y)
         tried = AttemptedStep(
-            t0=s.tprev,
-            t1=s.tnext,
-            y0=s.y,
-            y1=s.y,
-            accepted=jnp.array(False),
-            jump=made_jump,
-            start=s.tprev,
+            t0=s.tprev, t1=s.tnext, y0=s.y, y1=s.y, accepted=jnp.array(False), jump=made_jump, start=s.tprev,
             end=s.tnext,
-        )
+        )  # fmt: skip
         rest = closure_convert(lambda *given: resting.restrained(*given), tried, pushed)
     functions = dict(
         rest=rest[0], first=first[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False,

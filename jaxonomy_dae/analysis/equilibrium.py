@@ -207,15 +207,9 @@ def find_equilibrium(
     w, remaining = rows.sharpened(root, base)
     holds = root.good & (event < 0) & jnp.all(jnp.abs(remaining) <= root.limit) & jnp.all(jnp.isfinite(w))
     return Equilibrium(
-        x=rows.parts(w, base)[0],
-        q=rows.computed(w, base, *given),
-        residual=remaining,
-        limit=root.limit,
-        jacobian=root.jacobian,
-        unit=root.unit,
-        event=event,
-        holds=holds,
-    )
+        x=rows.parts(w, base)[0], q=rows.computed(w, base, *given), residual=remaining, limit=root.limit,
+        jacobian=root.jacobian, unit=root.unit, event=event, holds=holds,
+    )  # fmt: skip
 
 
 compiled_search = compiled(find_equilibrium)

@@ -54,20 +54,10 @@ def handle(
     """
     events = _Events.of(problem, t, state, arrival, args, at_start)
     start = Instant(
-        state=state,
-        left=arrival.due,
-        caused=arrival.jumped,
-        delay=jnp.zeros_like(t),
-        round=arrival.due,
-        before=state.x,
-        approach=arrival.slope,
-        previous=state.q,
-        slope=arrival.slope,
-        arrived=state.x,
-        stuck=jnp.zeros((problem.facts.n_guards,), bool),
-        noted=noted,
-        wrote=events.rivals.nobody,
-    )
+        state=state, left=arrival.due, caused=arrival.jumped, delay=jnp.zeros_like(t), round=arrival.due,
+        before=state.x, approach=arrival.slope, previous=state.q, slope=arrival.slope, arrived=state.x,
+        stuck=jnp.zeros((problem.facts.n_guards,), bool), noted=noted, wrote=events.rivals.nobody,
+    )  # fmt: skip
     length = _most_in_turn(problem)
     # Loops of fixed length, whose bodies are skipped where nothing is left: reverse mode cannot go back over a `while`.
     # Of a thousand clocks, few tick at once: loops in a loop pass over the others in √1000 steps.
@@ -106,19 +96,11 @@ class _Events(NamedTuple):
         # At the initial time, a guard that is zero and begins to fall has its event in the first step, not now.
         waits = (arrival.size == 0) & (arrival.rate < 0) & ~arrival.due[c:] if at_start else np.zeros(g, bool)
         return _Events(
-            problem=problem,
-            t=t,
-            arrival=arrival,
-            args=args,
-            at_start=at_start,
-            first=state.count,
-            rivals=Rivals.of(facts),
-            listed=facts.are(EventFlag.LISTED) & (np.arange(c + g) >= c) & (not at_start),
-            ends=jnp.asarray(facts.ends).astype(t.dtype),
-            relations=jnp.asarray(facts.are(EventFlag.RELATION)),
-            strikes=jnp.asarray(facts.are(EventFlag.STRIKE)),
-            waits=waits,
-        )
+            problem=problem, t=t, arrival=arrival, args=args, at_start=at_start, first=state.count,
+            rivals=Rivals.of(facts), listed=facts.are(EventFlag.LISTED) & (np.arange(c + g) >= c) & (not at_start),
+            ends=jnp.asarray(facts.ends).astype(t.dtype), relations=jnp.asarray(facts.are(EventFlag.RELATION)),
+            strikes=jnp.asarray(facts.are(EventFlag.STRIKE)), waits=waits,
+        )  # fmt: skip
 
     @property
     def several(self) -> bool:
@@ -203,17 +185,9 @@ class _Events(NamedTuple):
         if self.several:
             these = these | (instant.left & self.strikes & self.strikes[event])
         return Happening(
-            event=event,
-            is_clock=is_clock,
-            these=these,
-            delay=delay,
-            rates=rates,
-            moved=np.False_,
-            approach=jnp.where(instant.caused | self.at_start, 0.0, rates),
-            rose=rose,
-            onto=onto,
-            waits=self.waits,
-        )
+            event=event, is_clock=is_clock, these=these, delay=delay, rates=rates, moved=np.False_,
+            approach=jnp.where(instant.caused | self.at_start, 0.0, rates), rose=rose, onto=onto, waits=self.waits,
+        )  # fmt: skip
 
     def _again(self, now: Happening, stuck: Array, turns: Array) -> Array:
         """The number of an event that happens again and again at this instant, or −1."""

@@ -189,15 +189,11 @@ def _finding(plan: SystemPlan, known: Known, block: Block, rank: Rank | SparseRa
     singular, n = not rank.is_regular, len(names)
     undecided = singular and n <= DENSE_LIMIT and is_undecided(block.jacobian(known).toarray())
     return BlockFinding(
-        condition=rank.condition if rank.is_regular else np.inf,
-        singular=singular,
-        size=n,
-        variables=tuple(variables) or tuple(names),
-        equations=tuple(dict.fromkeys(equations or texts)),
-        causes=causes,
-        causes_are_parameters=bool(causes) and causes[0][0] in plan.flat.parameters.names,
+        condition=rank.condition if rank.is_regular else np.inf, singular=singular, size=n,
+        variables=tuple(variables) or tuple(names), equations=tuple(dict.fromkeys(equations or texts)),
+        causes=causes, causes_are_parameters=bool(causes) and causes[0][0] in plan.flat.parameters.names,
         undecided=undecided,
-    )
+    )  # fmt: skip
 
 
 def _causes(plan: SystemPlan, known: Known, block: Block, rank: Rank | SparseRank) -> tuple[tuple[str, float], ...]:

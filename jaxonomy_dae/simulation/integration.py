@@ -164,18 +164,11 @@ def run(
     end: Any = done.last[1]
     with_events = parts.problem is not None
     return Outcome(
-        found=begin.found._replace(jacobian=None),
-        ts=rows.ts,
-        x=x,
-        last=rows.last,
-        stats=done.stats,
+        found=begin.found._replace(jacobian=None), ts=rows.ts, x=x, last=rows.last, stats=done.stats,
         result=_result(given, parts, done.result, rows, consistent),
-        is_stiff=consistent & (done.result == STIFF) if watch is not None else jnp.array(False),
-        discrete=discrete,
-        events=EventLog.of(end) if with_events else None,
-        held=end.q if with_events else None,
-        memory=rows.memory,
-    )
+        is_stiff=consistent & (done.result == STIFF) if watch is not None else jnp.array(False), discrete=discrete,
+        events=EventLog.of(end) if with_events else None, held=end.q if with_events else None, memory=rows.memory,
+    )  # fmt: skip
 
 
 def _started(given: Given, checked: bool, begun: Found | InitialPoint | None) -> _Start:
@@ -229,18 +222,10 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
     y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
     clashes = y0.stuck < -1
     return _Parts(
-        term=HybridTerm(problem),
-        solver=WithEvents(chosen, options.max_events, options.room, options.save_events),
-        controller=ending(controller, AtEvents()),
-        dt0=dt0,
-        problem=problem,
-        y0=y0,
-        saved=_with_events,
-        admitted=admitted,
-        consistent=consistent,
-        goes_on=admitted & (y0.ended == 0) & ~clashes,
-        clashes=clashes,
-    )
+        term=HybridTerm(problem), solver=WithEvents(chosen, options.max_events, options.room, options.save_events),
+        controller=ending(controller, AtEvents()), dt0=dt0, problem=problem, y0=y0, saved=_with_events,
+        admitted=admitted, consistent=consistent, goes_on=admitted & (y0.ended == 0) & ~clashes, clashes=clashes,
+    )  # fmt: skip
 
 
 def _rows(given: Given, begin: _Start, parts: _Parts, done: Run) -> _Rows:

@@ -293,15 +293,10 @@ class _Call:
         if adjoint is None:
             adjoint = default_adjoint(is_forwards(self.given), batch_size(self.given), self.known)
         return Options(
-            solver=solver,
-            adjoint=adjoint,
-            controller=clipped(steps, self.jump_ts, self.ends),
-            max_steps=self.max_steps + self.ends.count,
-            progress=self.progress,
-            max_events=self.bounds[1],
-            room=room,
+            solver=solver, adjoint=adjoint, controller=clipped(steps, self.jump_ts, self.ends),
+            max_steps=self.max_steps + self.ends.count, progress=self.progress, max_events=self.bounds[1], room=room,
             save_events=few and self.known if self.save_events is None else self.save_events,
-        )
+        )  # fmt: skip
 
     def watch(self, traced: bool) -> Watch | None:
         """What watches whether explicit steps are the right ones. Where the default cannot be replaced, it would cost
@@ -391,19 +386,10 @@ class _Call:
     ) -> Solution:
         ts, states, discrete = saved
         return Solution(
-            ts=ts,
-            states=states,
-            system=self.system,
-            inputs=self.given.inputs,
-            counts=counts,
-            result=outcome.result,
-            solver=self.choice.solver,
-            reason=self.choice.reason,
-            discrete=discrete,
-            event_log=outcome.events,
-            memory=memory,
-            asked=self.asked,
-        )
+            ts=ts, states=states, system=self.system, inputs=self.given.inputs, counts=counts, result=outcome.result,
+            solver=self.choice.solver, reason=self.choice.reason, discrete=discrete, event_log=outcome.events,
+            memory=memory, asked=self.asked,
+        )  # fmt: skip
 
     def _failure(self, solution: Solution, outcome: Outcome) -> Exception:
         """The error of a run that failed."""

@@ -170,21 +170,11 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         phi = jnp.zeros((ROWS, y.shape[0]), y.dtype).at[0].set(y).at[1].set(h.astype(y.dtype) * slope)
         still = jax.lax.stop_gradient(h)
         return _History(
-            phi=phi,
-            psi=h * jnp.arange(1, ROWS + 1, dtype=h.dtype),
-            order=one,
-            last_order=zero,
-            steady=zero,
-            last_step=jnp.zeros_like(still),
-            planned=still,
-            starting=jnp.array(True),
-            factor=factor,
-            factor_cj=jnp.zeros_like(still),
-            last_cj=jnp.zeros_like(still),
-            contraction=jnp.full((), 20.0, h.dtype),
-            counts=counts,
-            largest=largest,
-        )
+            phi=phi, psi=h * jnp.arange(1, ROWS + 1, dtype=h.dtype), order=one, last_order=zero, steady=zero,
+            last_step=jnp.zeros_like(still), planned=still, starting=jnp.array(True), factor=factor,
+            factor_cj=jnp.zeros_like(still), last_cj=jnp.zeros_like(still), contraction=jnp.full((), 20.0, h.dtype),
+            counts=counts, largest=largest,
+        )  # fmt: skip
 
     def step(self, terms, t0, t1, y0, args, solver_state: _History, made_jump):
         """One step with its error estimate and dense output; see `diffrax.AbstractSolver.step`."""
@@ -243,21 +233,11 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         updated = _advance(phi, e, order, self.max_order)
         h_ = still(h)
         new_state = _History(
-            phi=updated,
-            psi=c.psi,
-            order=ahead.order,
-            last_order=order,
-            steady=ahead.steady,
-            last_step=h_,
-            planned=h_ * ahead.factor.astype(h_.dtype),
-            starting=ahead.starting,
-            factor=solved.factor,
-            factor_cj=solved.factor_cj,
-            last_cj=still(cj),
-            contraction=solved.contraction,
-            counts=state.counts + jnp.stack([solved.factorisations, solved.iterations]),
-            largest=largest,
-        )
+            phi=updated, psi=c.psi, order=ahead.order, last_order=order, steady=ahead.steady, last_step=h_,
+            planned=h_ * ahead.factor.astype(h_.dtype), starting=ahead.starting, factor=solved.factor,
+            factor_cj=solved.factor_cj, last_cj=still(cj), contraction=solved.contraction,
+            counts=state.counts + jnp.stack([solved.factorisations, solved.iterations]), largest=largest,
+        )  # fmt: skip
         # The controller divides the error by the same scale, which must be finite where y1 is not.
         value = jnp.where(jnp.isfinite(y1), y1, y)
         scale = atol + jnp.maximum(jnp.abs(y), jnp.abs(value)) * rtol
