@@ -141,6 +141,7 @@ def _stages(file: Path, references: Path, gradients: bool, row: dict, roots: Seq
     yield "compiled"
     said = flat.experiment
     begin, end = said.get("StartTime", 0.0), said.get("StopTime", 1.0)
+    end = end if end > begin else begin + 1.0  # of a model that is only initialized
     ts = np.unique(data[:, 0]) if len(data) else np.linspace(begin, end, 201)
     ts = ts[(ts >= begin) & (ts <= end)]
     ts = jnp.asarray(ts[:: -(-len(ts) // POINTS)])
