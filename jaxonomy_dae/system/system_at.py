@@ -18,7 +18,6 @@ from jax import Array
 from ..aliases import Args, Time
 from ..errors import ModelError
 from ..linear.arrays import Numbers
-from ..linear.dense import solve_dense
 from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve
@@ -306,7 +305,7 @@ class SystemAt:
             size = size + absent
         jacobian, value = jacobian / size[:, None], value / size
         gram = jacobian @ jacobian.T
-        multiplier = solve_dense(gram if absent is None else gram + jnp.diag(absent), value)
+        multiplier = jnp.linalg.solve(gram if absent is None else gram + jnp.diag(absent), value)
         return jnp.concatenate([x[:n] - nominal * (multiplier @ jacobian), x[n:]])
 
     def _least_norm_of_few(self, state: Chunk) -> Array:
