@@ -12,14 +12,14 @@ from ..system.system import AcausalSystem
 from .coordinates import Coordinates
 from .filtering import Filter, Innovations, check_model
 from .multiple_shooting import Shooting
-from .program import weights_of
+from .program import SensorLaw, weights_of
 from .training import Training
 
 METHODS = ("single", "growing")
 
 
 def names_to_train(
-    system: AcausalSystem, observers: dict[str, Any], train: Sequence[str] | str | None
+    system: AcausalSystem, observers: Mapping[str, SensorLaw], train: Sequence[str] | str | None
 ) -> tuple[list[str], list[str]]:
     """(parameters one by one, modules) to be trained."""
     chosen = list(system.neural) if train is None else [train] if isinstance(train, str) else list(train)
@@ -70,7 +70,7 @@ def check_start(system: AcausalSystem, trained: Sequence[str], name: str, is_unk
             )
 
 
-def penalties(system: AcausalSystem, modules: Sequence[str], given: Any) -> dict[str, Any]:
+def penalties(system: AcausalSystem, modules: Sequence[str], given: Any) -> dict[str, float | str | None]:
     """The regularization of each trained module's weights: "evidence", a precision, or None."""
     if not isinstance(given, Mapping):
         given = {name: given for name in modules if name in system.neural}
@@ -83,7 +83,7 @@ def penalties(system: AcausalSystem, modules: Sequence[str], given: Any) -> dict
     return {name: given.get(name) for name in modules}
 
 
-def checked_method(system: AcausalSystem, given: Any) -> str | Shooting | Filter | Innovations:
+def checked_method(system: AcausalSystem, given: object) -> str | Shooting | Filter | Innovations:
     """The method, if it is one and goes with the model."""
     if isinstance(given, Filter | Innovations):
         check_model(given, system)

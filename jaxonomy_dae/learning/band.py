@@ -1,7 +1,7 @@
 """A learned law with its spread, and where the data explored it."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -46,7 +46,7 @@ class Band:
         self,
         ax: Axes | None = None,
         *,
-        truth: ArrayLike | Callable[[np.ndarray], ArrayLike] | None = None,
+        truth: ArrayLike | Sequence[float] | Callable[[np.ndarray], ArrayLike] | None = None,
         label: str = "learned",
     ) -> Axes:
         """Draws the law with its band and the region explored; returns Matplotlib axes.

@@ -19,12 +19,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..aliases import PyTree
 from ..errors import ModelError, nearest
 from ..modeling.interval import Interval, closed_ends
 from ..system.parameters import ParameterNames
 from .data import Stacked
 from .experiment import Unknown
-from .priors import LogNormal, Normal
+from .priors import LogNormal, Normal, Prior
 from .program import Setting
 
 
@@ -117,7 +118,7 @@ class Coordinates:
         """True for the coordinates that a name stands for: the one of this name, or all of a group, shape (p,)."""
         return np.array([name in (own, group) for own, group in zip(self.names, self.group, strict=True)], bool)
 
-    def changed(self, values: dict[str, Any], fixed: bool) -> "Coordinates":
+    def changed(self, values: Mapping[str, Any], fixed: bool) -> "Coordinates":
         """A copy with other starts, by name. They stay `fixed`, or are only where the search begins."""
         start, held = np.array(self.start), np.array(self.fixed)
         for name, value in values.items():
@@ -139,7 +140,7 @@ class Coordinates:
                 held |= chosen
         return dataclasses.replace(self, start=start, fixed=held)
 
-    def bounded(self, bounds: dict[str, Any]) -> "Coordinates":
+    def bounded(self, bounds: Mapping[str, Any]) -> "Coordinates":
         """Narrower bounds by names, pairs of natural values."""
         low, high = np.array(self.low), np.array(self.high)
         for name, given in bounds.items():
@@ -156,13 +157,13 @@ class Coordinates:
             low[chosen], high[chosen] = new_low, new_high
         return dataclasses.replace(self, low=low, high=high)
 
-    def with_priors(self, priors: Mapping[str, Any]) -> "Coordinates":
+    def with_priors(self, priors: Mapping[str, Prior]) -> "Coordinates":
         """A copy with priors of parameters by name, each on the scale on which it is normal; a pair is a range."""
         columns = {name: np.array(getattr(self, name)) for name in ("log", "size", "start", "low", "high", "spread")}
         centre = np.array(self.centre)
         for name, prior in priors.items():
             chosen = np.array([name == group for group in self.group], bool)
-            new: dict[str, Any] = {}
+            new: dict[str, float | np.ndarray] = {}
             if isinstance(prior, Normal):
                 new = {"log": False, "size": prior.spread, "spread": 1.0}
                 centre[chosen] = prior.mean / prior.spread
@@ -189,7 +190,7 @@ class Coordinates:
 
 
 def coordinates(
-    setting: Setting, stacked: Stacked, extras: tuple[Coordinate, ...], priors: Mapping[str, Any]
+    setting: Setting, stacked: Stacked, extras: tuple[Coordinate, ...], priors: Mapping[str, Prior]
 ) -> Coordinates:
     """The coordinates of a problem, which start at the values of its system and at the guesses of unknown starts;
     `extras` come with its method, `priors` by names of parameters."""
@@ -232,7 +233,7 @@ def is_positive(interval: Interval) -> bool:
     return interval.low > 0 or (interval.low == 0 and interval.open_low)
 
 
-def _named_weights(name: str, module: Any) -> list[tuple[str, float]]:
+def _named_weights(name: str, module: PyTree) -> list[tuple[str, float]]:
     """The numbers of a module, named by the place of their array in it."""
     found = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(module):
@@ -244,7 +245,7 @@ def _named_weights(name: str, module: Any) -> list[tuple[str, float]]:
     return found
 
 
-def _start(label: str, units: dict[str, str], name: str, given: Any, table: ParameterNames) -> Coordinate:
+def _start(label: str, units: dict[str, str], name: str, given: float | Unknown, table: ParameterNames) -> Coordinate:
     low, high = -math.inf, math.inf
     log = False
     if name in table.names:
@@ -252,10 +253,10 @@ def _start(label: str, units: dict[str, str], name: str, given: Any, table: Para
         low, high = closed_ends([interval])[0]
         log = is_positive(interval)
     known = not isinstance(given, Unknown)
-    guess = float(given if known else given.guess)
+    guess = float(given.guess if isinstance(given, Unknown) else given)
     if not low <= guess <= high:
         raise ModelError(f"{label}: the guess must lie in [{low:g}, {high:g}], as '{name}' does; got {guess:g}")
-    spread = math.inf if known or given.spread is None else float(given.spread)
+    spread = float(given.spread) if isinstance(given, Unknown) and given.spread is not None else math.inf
     size = 1.0 if log else spread if math.isfinite(spread) else abs(guess) or 1.0
     spread /= guess if log else size
     centre = math.log(guess) if log else guess / size

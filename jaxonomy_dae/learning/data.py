@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -84,7 +84,7 @@ class Stacked:
     holdout: Bool[np.ndarray, " e"]
     inputs: dict[str, tuple[Float[np.ndarray, "e m"], Float[np.ndarray, "e m"]]]
     kinds: tuple[tuple[str, str], ...]  # of inputs
-    starts: dict[str, tuple[Any, ...]]  # a number or an Unknown for each experiment
+    starts: dict[str, tuple[float | Unknown, ...]]  # a number or an Unknown for each experiment
     labels: tuple[str, ...]
     counts: tuple[int, ...]  # of times
 
@@ -132,7 +132,7 @@ class Stacked:
         return dataclasses.replace(self, times=times, observed=self.observed & inside[:, :, None])
 
 
-def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: dict[str, Any]) -> Stacked:
+def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mapping[str, object]) -> Stacked:
     """The data of a system whose `derived` outputs are computed from its variables; `starts` are for experiments that
     do not name them."""
     experiments = data.experiments
@@ -224,7 +224,9 @@ def _columns(
     return column, sigma, noises
 
 
-def _inputs(data: Data, plan: SystemPlan) -> tuple[dict[str, Any], tuple[tuple[str, str], ...]]:
+def _inputs(
+    data: Data, plan: SystemPlan
+) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], tuple[tuple[str, str], ...]]:
     """Samples of every input, padded beyond their ends to the same number, and how each is interpolated."""
     names = dict.fromkeys(name for one in data.experiments for name in one.inputs)
     found, kinds = {}, []
@@ -254,7 +256,7 @@ def _inputs(data: Data, plan: SystemPlan) -> tuple[dict[str, Any], tuple[tuple[s
     return found, tuple(kinds)
 
 
-def _samples(name: str, source: Any, one: Experiment, label: str) -> tuple[np.ndarray, np.ndarray, str | None]:
+def _samples(name: str, source: object, one: Experiment, label: str) -> tuple[np.ndarray, np.ndarray, str | None]:
     """(times, values, kind) of an input; a constant is of any kind."""
     end = float(one.times[-1])
     if isinstance(source, int | float | np.number):
@@ -293,7 +295,7 @@ def _beyond(times: np.ndarray, m: int) -> np.ndarray:
     return np.concatenate([times, times[-1] + step * np.arange(1, m - len(times) + 1)])
 
 
-def _starts(data: Data, given: dict[str, Any]) -> dict[str, tuple[Any, ...]]:
+def _starts(data: Data, given: Mapping[str, Any]) -> dict[str, tuple[float | Unknown, ...]]:
     """The start of each name in each experiment."""
     names = dict.fromkeys([*given, *(name for one in data.experiments for name in one.initial)])
     out = {}

@@ -17,7 +17,6 @@ its own size, an unknown start to its spread. So directions that nothing determi
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +28,7 @@ from ..errors import InitializationError, ModelError, SimulationError, nearest, 
 from .coordinates import Coordinates
 from .data import Stacked
 from .estimate import Estimate
-from .experiment import Planned
+from .experiment import Planned, Unknown
 from .filter_program import Ahead
 from .identifiability import natural_scale
 from .objective import Objective
@@ -108,7 +107,7 @@ class Known:
         return {n: float(v) for n, v in zip(names[plain], np.sqrt(variance[plain]), strict=True)}
 
 
-def known_of(source: Problem | Estimate, names: Any, alone: bool) -> Known:
+def known_of(source: Problem | Estimate, names: Sequence[str] | str | None, alone: bool) -> Known:
     """The information of a problem at its nominal values, or of an estimate at its own."""
     if isinstance(source, Estimate):
         problem, objective = source.problem, source.objective
@@ -132,7 +131,9 @@ def known_of(source: Problem | Estimate, names: Any, alone: bool) -> Known:
     return Known(problem, objective, natural, information, shared, scale, _chosen(objective, shared, names))
 
 
-def _chosen(objective: Objective, shared: Bool[np.ndarray, " shared"], names: Any) -> Bool[np.ndarray, " s"]:
+def _chosen(
+    objective: Objective, shared: Bool[np.ndarray, " shared"], names: Sequence[str] | str | None
+) -> Bool[np.ndarray, " s"]:
     c = objective.coordinates
     if names is None:
         return np.ones(int(shared.sum()), bool)
@@ -310,8 +311,8 @@ def _is_known(stacked: Stacked, name: str, k: int) -> bool:
 def _start_scales(stacked: Stacked, layout: Layout) -> np.ndarray:
     """The uncertainty of each own start before any data: its spread, or its own size; shape (candidates, own)."""
 
-    def scale(given: Any) -> float:
-        if isinstance(given, float):
+    def scale(given: float | Unknown) -> float:
+        if not isinstance(given, Unknown):
             return 1.0
         return float(given.spread) if given.spread is not None else abs(float(given.guess)) or 1.0
 

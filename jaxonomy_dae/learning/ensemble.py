@@ -1,22 +1,27 @@
 """Fits from several sets of weights: what depends on where a network began is not known."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
-from jaxtyping import Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
+from ..aliases import PyTree
 from ..errors import ModelError, SimulationError, nearest, whole_number
+from ..simulation.solution import Solution
 from ..system.system import AcausalSystem
 from .band import Band
 from .estimate import Estimate
 from .prediction import Prediction
 from .problem import Problem
+
+Network = TypeVar("Network", bound=PyTree)
 
 REJECTED = 1e-3  # the probability below which noise is no excuse for a worse fit
 
@@ -46,7 +51,14 @@ class Ensemble:
         left = len(self.estimates) - len(self.kept)
         return f"Ensemble(of {len(self.kept)}, χ² {chi2}" + f"; {left} more ended in worse minima" * bool(left) + ")"
 
-    def band(self, name: str, grid: Any, law: Any = None, along: Any = None, level: float = 0.95) -> Band:
+    def band(
+        self,
+        name: str,
+        grid: ArrayLike | Sequence[float],
+        law: Callable[[PyTree, Array], ArrayLike] | None = None,
+        along: str | Callable[[Solution], ArrayLike] | None = None,
+        level: float = 0.95,
+    ) -> Band:
         """A learned law over a grid, as `Estimate.band`: the mean of the members. Its spread combines their
         disagreement, `between`, and the spread of each member."""
         bands = [one.band(name, grid, law, along, level) for one in self.kept]
@@ -59,7 +71,11 @@ class Ensemble:
         )  # fmt: skip
 
     def predict(
-        self, names: str | Sequence[str], ts: Any = None, experiment: int | str = 0, level: float = 0.95
+        self,
+        names: str | Sequence[str],
+        ts: ArrayLike | Sequence[float] | None = None,
+        experiment: int | str = 0,
+        level: float = 0.95,
     ) -> Prediction:
         """Any variables, as `Estimate.predict`, with the members' disagreement in the band."""
         found = [one.predict(names, ts, experiment, level) for one in self.kept]
@@ -76,7 +92,7 @@ def ensemble(
     members: int = 8,
     *,
     seed: int = 0,
-    networks: Mapping[str, Sequence[Any]] | None = None,
+    networks: Mapping[str, Sequence[PyTree]] | None = None,
     **options: Any,
 ) -> Ensemble:
     """Fits from several seeds of the networks' weights, one after the other, with the compiled program of a single fit.
@@ -130,7 +146,7 @@ def _deviance(estimate: Estimate) -> float:
 
 
 def _starts(
-    problem: Problem, modules: list[str], members: int, seed: int, networks: Mapping[str, Sequence[Any]] | None
+    problem: Problem, modules: list[str], members: int, seed: int, networks: Mapping[str, Sequence[PyTree]] | None
 ) -> list[AcausalSystem]:
     system = problem.system
     if networks is None:
@@ -147,18 +163,18 @@ def _starts(
     return [_with(system, {n: given[k] for n, given in networks.items()}) for k in range(min(counts.values()))]
 
 
-def _with(system: AcausalSystem, networks: dict[str, Any]) -> AcausalSystem:
+def _with(system: AcausalSystem, networks: Mapping[str, PyTree]) -> AcausalSystem:
     for name, network in networks.items():
         if jax.tree.structure(network) != jax.tree.structure(system.neural[name]):
             raise ModelError(f"networks: those of '{name}' must be built like the one in the system")
-    return eqx.tree_at(lambda s: s.neural, system, system.neural | networks)
+    return eqx.tree_at(lambda s: s.neural, system, {**system.neural, **networks})
 
 
-def _drawn(network: Any, rng: np.random.Generator) -> Any:
+def _drawn(network: Network, rng: np.random.Generator) -> Network:
     """A copy of the network with random weights, each array normal and of the size that it has."""
     arrays, rest = eqx.partition(network, eqx.is_inexact_array)
 
-    def other(leaf: Any) -> Any:
+    def other(leaf: Array) -> Array:
         size = float(jnp.sqrt(jnp.mean(leaf**2))) if leaf.size else 0.0
         return jnp.asarray(size * rng.standard_normal(leaf.shape), leaf.dtype)
 

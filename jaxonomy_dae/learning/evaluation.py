@@ -1,10 +1,10 @@
 """Residuals at a point, and how much each of them counts."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .noise import Tails
 from .smoothness import Bends
@@ -77,7 +77,7 @@ class Weights:
         """√ of Fisher's information of each sample about its mean."""
         return self.row if self.tails is None else self.row * np.sqrt(self.tails.information())
 
-    def part(self, rows: Any) -> "Weights":
+    def part(self, rows: Bool[np.ndarray, " m"]) -> "Weights":
         """The weights of some residuals."""
         tails = None if self.tails is None else self.tails[rows]
         return dataclasses.replace(self, row=self.row[rows], share=self.share[rows], tails=tails)

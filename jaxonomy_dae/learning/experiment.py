@@ -5,15 +5,20 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from ..errors import ModelError, nearest, whole_number
 from ..lowering.plan import SystemPlan
 from .noise import ESTIMATE, Noise
 from .priors import is_finite
 from .records import interpolated, low_pass, smoothed, untrended
+
+Numbers: TypeAlias = ArrayLike | Sequence[float]
+Samples: TypeAlias = float | tuple[Numbers, Numbers] | tuple[Numbers, Numbers, str]  # of an input
 
 UNEVEN = 1e-3  # of a time step, by which steps may differ and still count as even
 
@@ -67,8 +72,8 @@ class Experiment:
     times: Any
     data: Mapping[str, Any]
     sigma: Mapping[str, Any] | float | str | np.ndarray | Noise = ESTIMATE
-    inputs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    initial: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    inputs: Mapping[str, Samples] = dataclasses.field(default_factory=dict)
+    initial: Mapping[str, float | Unknown] = dataclasses.field(default_factory=dict)
     weight: float = 1.0
     holdout: bool = False
     t0: float = 0.0
@@ -116,7 +121,7 @@ class Experiment:
         data: Sequence[str] | Mapping[str, str],
         *,
         time: str | None = None,
-        inputs: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, Samples | str | tuple[str, str]] | None = None,
         **others: Any,
     ) -> "Experiment":
         """A record from a pandas data frame, or from any object with columns by name.
@@ -141,7 +146,9 @@ class Experiment:
         return cls(times, values, inputs=given, **others)
 
     @classmethod
-    def from_csv(cls, path: Any, data: Sequence[str] | Mapping[str, str], *, time: str, **others: Any) -> "Experiment":
+    def from_csv(
+        cls, path: str | Path, data: Sequence[str] | Mapping[str, str], *, time: str, **others: Any
+    ) -> "Experiment":
         """A record from a text file with commas, whose first line names the columns; empty cells are missing samples.
         Dates are understood. `data`, `inputs` and `others` as in `from_frame`."""
         with open(path, newline="", encoding="utf-8") as file:
@@ -153,7 +160,7 @@ class Experiment:
 
     # --- parts of a record, and coarser ones ---------------------------------------------------------------------
 
-    def window(self, start: float, end: float, initial: Mapping[str, Any] | None = None) -> "Experiment":
+    def window(self, start: float, end: float, initial: Mapping[str, float | Unknown] | None = None) -> "Experiment":
         """The samples from `start` to `end`, as an experiment that begins at `start`. `initial` replaces the values
         known at `t0`.
 
@@ -177,7 +184,7 @@ class Experiment:
         sigma = {name: _rows(level, rows) for name, level in self._noise.items()}
         return self.changed(times=self.times[rows], data=data, sigma=sigma, initial=dict(self.initial) | new, t0=start)
 
-    def resample(self, times: Any) -> "Experiment":
+    def resample(self, times: Numbers) -> "Experiment":
         """The record at other times, by linear interpolation. Samples are NaN if a neighbour is missing, and outside
         the record. Samples with a common neighbour no longer have independent noise; use `decimate` to reduce the
         number of samples."""
@@ -233,7 +240,7 @@ class Experiment:
         """The standard deviation for each name, or for each of its samples; NaN where it is to be estimated."""
         noises = {name: self.noise(name) for name in self.data}
         plain = {name for name, one in noises.items() if one.scale is None or math.isnan(one.number)}
-        return {name: one.number * (1.0 if name in plain else one.scale) for name, one in noises.items()}
+        return {name: one.number if name in plain else one.number * one.scale for name, one in noises.items()}
 
     @property
     def _noise(self) -> "dict[str, float | np.ndarray | Noise]":
@@ -245,9 +252,15 @@ class Experiment:
         given = self._noise[name]
         if isinstance(given, Noise):
             return given
-        return Noise(1.0, scale=given) if np.ndim(given) else Noise(ESTIMATE if np.isnan(given) else float(given))
+        return (
+            Noise(1.0, scale=given)
+            if isinstance(given, np.ndarray)
+            else Noise(ESTIMATE if np.isnan(given) else float(given))
+        )
 
-    def _each(self, change: Callable[[Any], Any], names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    def _each(
+        self, change: Callable[[np.ndarray], np.ndarray], names: Sequence[str] | None = None
+    ) -> dict[str, np.ndarray]:
         """The signals, changed as columns, in their shapes."""
         found = {}
         for name in self.data if names is None else names:
@@ -266,16 +279,18 @@ class Experiment:
         return dataclasses.replace(self, **changes | {"sigma": sigma})
 
 
-def _rows(level: Any, rows: Any, factor: float = 1.0) -> Any:
+def _rows(
+    level: "float | np.ndarray | Noise", rows: slice | np.ndarray, factor: float = 1.0
+) -> "float | np.ndarray | Noise":
     """The noise of some rows, of a factor less where its level is known."""
     if isinstance(level, Noise):
         scale = None if level.scale is None else level.scale[rows]
         known = level.level if isinstance(level.level, str) else level.level * factor
         return dataclasses.replace(level, level=known, scale=scale)
-    return (level if np.ndim(level) == 0 else level[rows]) * factor
+    return (level[rows] if isinstance(level, np.ndarray) else level) * factor
 
 
-def _levels_of(name: str, given: Any, samples: np.ndarray) -> np.ndarray:
+def _levels_of(name: str, given: Numbers, samples: np.ndarray) -> np.ndarray:
     """A noise level for each sample; one where there is none."""
     levels = np.asarray(given)
     if levels.dtype.kind not in "iuf" or levels.shape != samples.shape:
@@ -301,7 +316,7 @@ def check_increasing(times: np.ndarray, where: str = "") -> None:
         )
 
 
-def _times(given: Any, t0: float) -> np.ndarray:
+def _times(given: Numbers, t0: float) -> np.ndarray:
     times = np.asarray(given)
     if times.ndim != 1 or not len(times) or times.dtype.kind not in "iuf":
         raise ModelError(f"times are numbers of shape (n,), n ≥ 1; got {times.dtype} of shape {times.shape}")
@@ -318,7 +333,7 @@ def _times(given: Any, t0: float) -> np.ndarray:
     return times
 
 
-def _samples(name: str, given: Any, count: int) -> np.ndarray:
+def _samples(name: str, given: Numbers, count: int) -> np.ndarray:
     values = np.asarray(given)
     if values.dtype.kind not in "biuf":
         raise ModelError(f"data of '{name}' must be real numbers; got {values.dtype}")
@@ -359,7 +374,7 @@ def _without_zone(stamp: Any) -> Any:
     return stamp
 
 
-def _cells(texts: list[str]) -> Any:
+def _cells(texts: list[str]) -> np.ndarray | list[str]:
     """Numbers where all cells are numbers or empty; the texts themselves otherwise."""
     try:
         return np.array([float(t) if t and t.strip() else math.nan for t in texts])
@@ -379,8 +394,8 @@ class Planned:
 
     times: Any
     measure: Mapping[str, float]
-    inputs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    initial: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    inputs: Mapping[str, Samples] = dataclasses.field(default_factory=dict)
+    initial: Mapping[str, float | Unknown] = dataclasses.field(default_factory=dict)
     weight: float = 1.0
     t0: float = 0.0
     name: str = ""

@@ -7,7 +7,7 @@ coordinates that come with it (with guesses that the data suggest).
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from .coordinates import Coordinate
 from .data import Stacked
 from .experiment import ESTIMATE, Unknown
 from .linear_models import is_linear
+from .priors import is_finite
+
+Level: TypeAlias = float | str | Unknown  # a number, "estimate", or where its search begins
 
 FAR = 1e6  # how far, as a factor, a level may move from its guess: beyond, it counts as none, or as a bad guess
 HIDDEN = 0.1  # guessed noise of a state that was not measured, relative to measured ones, each in units of its size
@@ -43,7 +46,7 @@ class Filter:
     without a spread are estimated. Estimated noise levels of measurements are coordinates, too.
     """
 
-    noise: Mapping[str, Any]
+    noise: Mapping[str, Level]
     substeps: int = 1
 
     def __post_init__(self):
@@ -70,7 +73,7 @@ class Innovations:
         `"estimate"` or `Unknown(guess, spread)`. All other entries of K are zero.
     """
 
-    gain: Mapping[tuple[str, str], Any] | str = ESTIMATE
+    gain: Mapping[tuple[str, str], Level] | str = ESTIMATE
 
     def __post_init__(self):
         if isinstance(self.gain, str) and self.gain == ESTIMATE:
@@ -81,18 +84,17 @@ class Innovations:
                 "Innovations: gain is 'estimate', or a dictionary by pairs (state, output), "
                 f"{{('room.T', 'room.T'): 'estimate'}}; got {self.gain!r}"
             )
-        pairs: Any = self.gain
-        for (state, output), value in pairs.items():
+        assert not isinstance(self.gain, str)
+        for (state, output), value in self.gain.items():
             _check(f"Innovations: gain of '{state}' by '{output}'", value, positive=False)
 
 
-def _check(what: str, value: Any, positive: bool) -> None:
+def _check(what: str, value: object, positive: bool) -> None:
     """A number, "estimate" or an `Unknown`."""
     if isinstance(value, str) and value == ESTIMATE:
         return
-    number: Any = value.guess if isinstance(value, Unknown) else value
-    plain = isinstance(number, int | float | np.number) and not isinstance(number, bool)
-    if plain and math.isfinite(number) and (number > 0 or not positive):
+    number = value.guess if isinstance(value, Unknown) else value
+    if is_finite(number) and not isinstance(number, bool) and (number > 0 or not positive):
         return
     needed = "a number > 0" if positive else "a finite number"
     raise ModelError(f"{what} is {needed}, 'estimate' or Unknown(guess); got {value!r}")
@@ -183,9 +185,9 @@ def check_model(method: Filter | Innovations, system: AcausalSystem) -> None:
         )
 
 
-def _noise(method: Filter, system: AcausalSystem) -> list[tuple[str, Any, int | str, float]]:
+def _noise(method: Filter, system: AcausalSystem) -> list[tuple[str, Level, int | str, float]]:
     """(name, value, place, factor) of each intensity, those of arrays by their entries."""
-    found: list[tuple[str, Any, int | str, float]] = []
+    found: list[tuple[str, Level, int | str, float]] = []
     for name, value in method.noise.items():
         for one in system.plan.entry_names([name]):
             is_input = one in system.plan.inputs.place
@@ -197,7 +199,7 @@ def _noise(method: Filter, system: AcausalSystem) -> list[tuple[str, Any, int | 
     return found
 
 
-def _gains(method: Innovations, system: AcausalSystem, stacked: Stacked) -> list[tuple[str, Any, int, int, float]]:
+def _gains(method: Innovations, system: AcausalSystem, stacked: Stacked) -> list[tuple[str, Level, int, int, float]]:
     """(name, value, place, output, factor) of each entry of K."""
     given = method.gain
     if isinstance(given, str):
@@ -224,13 +226,13 @@ def _state(system: AcausalSystem, name: str, what: str) -> tuple[int, float]:
     return int(place[0]), float(factor[0])
 
 
-def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: bool) -> Coordinate:
+def _extra(name: str, unit: str, value: Level, guess: float, size: float, *, log: bool) -> Coordinate:
     known = not isinstance(value, Unknown | str)
     spread = math.inf
     if isinstance(value, Unknown):
         guess = float(value.guess)
         spread = math.inf if value.spread is None else float(value.spread) / (1.0 if log else size)
-    elif known:
+    elif not isinstance(value, str):
         guess = float(value)
     low, high = (guess / FAR, guess * FAR) if log else (-math.inf, math.inf)
     centre = math.log(guess) if log else guess / size

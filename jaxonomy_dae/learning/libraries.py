@@ -2,22 +2,27 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import sympy
+from jax.typing import ArrayLike
 
 from ..errors import ModelError, nearest
 from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
 from ..modeling.networks import count_outputs, of_scalars
 from .term import AbstractTerm, Inner, OfFunction, Power, Written, inner_of, local_name
 
+Text: TypeAlias = str | sympy.Expr | float
+# The terms of a block, from the names of its inputs, the number of its outputs, and what a message begins with.
+Entry: TypeAlias = Callable[[tuple[str, ...], int, str], list[AbstractTerm]]
+
 
 @dataclasses.dataclass(frozen=True)
 class Library:
     """Terms before it is known of which inputs. `powers(3) + terms("tanh(v/0.1)")` joins libraries."""
 
-    entries: tuple[Any, ...]
+    entries: tuple[Entry, ...]
 
     def __add__(self, other: "Library") -> "Library":
         if not isinstance(other, Library):
@@ -55,7 +60,7 @@ def powers(highest: int) -> Library:
     return Library((_Powers(highest),))
 
 
-def terms(*expressions: Any, **others: Callable[..., Any] | tuple[float, float]) -> Library:
+def terms(*expressions: Text | Sequence[Text], **others: Callable[..., ArrayLike] | tuple[float, float]) -> Library:
     """Terms from expressions and functions. Symbols that are not inputs are numbers to be found with the coefficients:
 
     ```python
@@ -79,14 +84,15 @@ def terms(*expressions: Any, **others: Callable[..., Any] | tuple[float, float])
         coefficient does.
     """
     ranges = {name: _range(name, given) for name, given in others.items() if not callable(given)}
-    entries: list[Any] = []
+    entries: list[Entry] = []
     for given in expressions:
-        parts = given if isinstance(given, tuple | list) else (given,)
-        if not all(isinstance(p, str | sympy.Expr | int | float) for p in parts):
+        row = given if isinstance(given, tuple | list) else (given,)
+        parts = tuple(p for p in row if isinstance(p, str | sympy.Expr | int | float))
+        if len(parts) < len(row):
             raise ModelError(
                 f"terms takes SymPy expressions, texts, or functions by name (drag=lambda v: …); got {given!r}"
             )
-        entries.append(_Expressions(tuple(parts), isinstance(given, tuple | list), tuple(ranges.items())))
+        entries.append(_Expressions(parts, isinstance(given, tuple | list), tuple(ranges.items())))
     entries.extend(_Function(name, function) for name, function in others.items() if callable(function))
     if not entries:
         raise ModelError('terms needs at least one expression or function: terms("v", "v*Abs(v)")')
@@ -120,7 +126,7 @@ class _Powers:
 
 @dataclasses.dataclass(frozen=True)
 class _Expressions:
-    parts: tuple[Any, ...]
+    parts: tuple[Text, ...]
     is_vector: bool
     ranges: tuple[tuple[str, tuple[float, float]], ...]  # of numbers inside, by name
 
@@ -143,7 +149,7 @@ class _Expressions:
         numbers = tuple(Inner(s.name, dict(self.ranges).get(s.name)) for s in inside)
         return Written(label, (*symbols, *inside), written, numbers)
 
-    def _read(self, part: Any, inputs: tuple[str, ...], symbols: tuple[sympy.Symbol, ...], where: str) -> sympy.Expr:
+    def _read(self, part: Text, inputs: tuple[str, ...], symbols: tuple[sympy.Symbol, ...], where: str) -> sympy.Expr:
         """An expression in the symbols of the inputs, and of the numbers inside it."""
         local = [local_name(name) for name in inputs]
         known = {n: s for n, s, count in zip(local, symbols, map(local.count, local), strict=True) if count == 1}
@@ -193,7 +199,7 @@ def _number(name: str, range: tuple[float, float] | None) -> sympy.Symbol:
 @dataclasses.dataclass(frozen=True)
 class _Function:
     name: str
-    function: Callable[..., Any]
+    function: Callable[..., ArrayLike]
 
     def __call__(self, inputs: tuple[str, ...], outputs: int, where: str) -> list[AbstractTerm]:
         found = count_outputs(of_scalars(self.function), len(inputs), f"{where}: term '{self.name}'", noun="function")

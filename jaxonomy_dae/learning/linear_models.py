@@ -7,12 +7,12 @@ The flow of such a model over a time, and the noise that it gathers, are those o
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..aliases import Numeric
 from ..system.system import AcausalSystem
 
 SMALL = 0.25  # of ‖A h‖, where the series begins
@@ -37,7 +37,7 @@ def is_linear(system: AcausalSystem) -> bool:
     return not _reaches(slopes, (t, x, u))[0] and not any(_reaches(jacobians, (t, x, u)))
 
 
-def _reaches(function: Callable, arguments: tuple[Any, ...]) -> list[bool]:
+def _reaches(function: Callable, arguments: tuple[jax.ShapeDtypeStruct, ...]) -> list[bool]:
     """True for the arguments on which the result may depend: those from which operations lead to it. All inputs of an
     operation with inner programs count as used."""
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
@@ -49,7 +49,7 @@ def _reaches(function: Callable, arguments: tuple[Any, ...]) -> list[bool]:
 
 
 def linear_flow(
-    a: Float[Array, "f f"], g: Float[Array, "f f"], h: Any
+    a: Float[Array, "f f"], g: Float[Array, "f f"], h: Numeric
 ) -> tuple[Float[Array, "f f"], Float[Array, "f f"]]:
     """exp(A h) − I, and ∫₀ʰ exp(A s) G exp(A s)ᵀ ds for symmetric G.
 
@@ -80,7 +80,11 @@ def linear_flow(
 
 
 def affine_flow(
-    a: Float[Array, "f f"], first: Float[Array, " f"], rate: Float[Array, " f"], g: Float[Array, "f f"], h: Any
+    a: Float[Array, "f f"],
+    first: Float[Array, " f"],
+    rate: Float[Array, " f"],
+    g: Float[Array, "f f"],
+    h: Numeric,
 ) -> tuple[Float[Array, " f"], Float[Array, "f f"], Float[Array, "f f"]]:
     """Integrates δ' = A δ + `first` + s·`rate` from zero over a time h, by the exponential of the matrix of (δ, 1, s).
     Returns (δ, exp(A h), the covariance of the noise gathered)."""

@@ -7,7 +7,7 @@ import math
 import numbers
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ import numpy as np
 import optax
 from tqdm import tqdm
 
+from ..aliases import Numeric, PyTree
 from ..diagnosis.unused_parameters import unused_parameters
 from ..diagnosis.wording import listed
 from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError, explained_keywords
@@ -59,11 +60,11 @@ class Minimized(Generic[Model]):
 @explained_keywords()
 def minimize(
     model: Model,
-    loss: Callable[..., Any],
+    loss: Callable[..., Numeric],
     optimizer: optax.GradientTransformation,
     steps: int,
     *,
-    train: Sequence[str] | Any = None,
+    train: Sequence[str] | PyTree = None,
     args: tuple = (),
     progress: bool = True,
 ) -> Minimized[Model]:
@@ -98,16 +99,7 @@ def minimize(
     - `ModelError` if the loss is not a real scalar or not finite at the start, if arrays in `args` are not finite, if
         nothing is to be trained, and inside jit, grad and vmap.
     """
-    if not isinstance(steps, numbers.Integral) or isinstance(steps, bool) or steps < 0:
-        raise ModelError(f"steps must be a number of updates ≥ 0; got {steps!r}")
-    if not callable(loss):
-        raise ModelError(f"loss is a function of the model, loss(model, *args); got {loss!r}")
-    if not isinstance(args, tuple):
-        raise ModelError(f"args is a tuple of further arguments, args=(data,); got {type(args).__name__}")
-    if is_traced((model, args)):
-        raise ModelError("minimize takes its steps in Python: call it outside jit, grad and vmap")
-    if not isinstance(optimizer, optax.GradientTransformation):
-        raise ModelError(f"optimizer must be one of Optax, such as optax.adam(0.02); got {optimizer!r}")
+    _check(model, loss, optimizer, steps, args)
     trainable, frozen = _split(model, train)
     if not jax.tree.leaves(trainable):
         raise ModelError("nothing is to be trained: `train` selects no arrays of the model")
@@ -170,7 +162,21 @@ def minimize(
     return Minimized(found, last, np.array(history), best_step, history[best_step], message)
 
 
-def _split(model: Any, train: Any) -> tuple[Any, Any]:
+def _check(model: object, loss: object, optimizer: object, steps: object, args: object) -> None:
+    """Refuses arguments that `minimize` does not take."""
+    if not isinstance(steps, numbers.Integral) or isinstance(steps, bool) or steps < 0:
+        raise ModelError(f"steps must be a number of updates ≥ 0; got {steps!r}")
+    if not callable(loss):
+        raise ModelError(f"loss is a function of the model, loss(model, *args); got {loss!r}")
+    if not isinstance(args, tuple):
+        raise ModelError(f"args is a tuple of further arguments, args=(data,); got {type(args).__name__}")
+    if is_traced((model, args)):
+        raise ModelError("minimize takes its steps in Python: call it outside jit, grad and vmap")
+    if not isinstance(optimizer, optax.GradientTransformation):
+        raise ModelError(f"optimizer must be one of Optax, such as optax.adam(0.02); got {optimizer!r}")
+
+
+def _split(model: PyTree, train: PyTree) -> tuple[PyTree, PyTree]:
     """(trainable, frozen) parts of a model."""
     if isinstance(model, AcausalSystem):
         names = tuple(model.neural) if train is None else (train,) if isinstance(train, str) else tuple(train)
@@ -196,11 +202,11 @@ def _warn_of_unused(trainable: AcausalSystem) -> None:
         )
 
 
-def _merged(model: Any) -> Any:
+def _merged(model: PyTree) -> PyTree:
     return model.merged() if isinstance(model, AcausalSystem) else model
 
 
-def _bounds(trainable: Any) -> tuple[Interval, ...]:
+def _bounds(trainable: PyTree) -> tuple[Interval, ...]:
     """The bounds of the parameters that are trained, in the order of `parameters.free`."""
     if not isinstance(trainable, AcausalSystem) or trainable.parameters.free is None:
         return ()
@@ -208,7 +214,7 @@ def _bounds(trainable: Any) -> tuple[Interval, ...]:
     return tuple(parameters.table.intervals[k] for k in parameters.free_index)
 
 
-def _check_dependents(model: Any) -> None:
+def _check_dependents(model: PyTree) -> None:
     problem = model.parameters.problem if isinstance(model, AcausalSystem) else None
     if problem is not None:
         warnings.warn(f"{problem}. Bound the parameters it depends on, too", RuntimeWarning, stacklevel=4)
@@ -224,7 +230,7 @@ def _what(loss: float) -> str:
     return "the gradient of the loss is not finite" if math.isfinite(loss) else f"the loss is {loss}"
 
 
-def _why(loss: Callable[..., Any], model: Any, args: tuple) -> str:
+def _why(loss: Callable[..., Numeric], model: PyTree, args: tuple) -> str:
     """The text of the error that a run inside the loss raises outside a compiled program; "" if it raises none."""
     try:
         loss(model, *args)

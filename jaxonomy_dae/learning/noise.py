@@ -77,7 +77,7 @@ class Tails:
     freedom: Float[np.ndarray, " m"]
     knee: Float[np.ndarray, " m"]
 
-    def __getitem__(self, rows: Any) -> "Tails":
+    def __getitem__(self, rows: Bool[np.ndarray, " m"]) -> "Tails":
         return Tails(self.freedom[rows], self.knee[rows])
 
     @property

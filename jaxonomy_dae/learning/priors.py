@@ -7,7 +7,7 @@ A prior chooses the scale on which its parameter is searched, so that it is norm
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 
@@ -45,7 +45,10 @@ class LogNormal:
             raise ModelError(f"LogNormal: factor is a number > 1; got {self.factor!r}")
 
 
-def priors_by_name(given: Mapping[str, Any], table: ParameterNames, unknown: Sequence[str]) -> dict[str, Any]:
+Prior: TypeAlias = Normal | LogNormal | tuple[float, float]  # a pair is a range
+
+
+def priors_by_name(given: Mapping[str, object], table: ParameterNames, unknown: Sequence[str]) -> dict[str, Prior]:
     """Priors of single parameters; a name of an array stands for each of its entries. A pair (low, high) is a range.
 
     **Arguments:**
@@ -57,7 +60,7 @@ def priors_by_name(given: Mapping[str, Any], table: ParameterNames, unknown: Seq
     - `ModelError` for names that are not estimated, for other kinds of priors, and for those outside of declared
         bounds.
     """
-    found: dict[str, Any] = {}
+    found: dict[str, Prior] = {}
     for name, prior in given.items():
         entries = table.entries(name)
         for one in [name] if entries is None else [table.names[k] for k in entries.ravel().tolist()]:
@@ -67,7 +70,7 @@ def priors_by_name(given: Mapping[str, Any], table: ParameterNames, unknown: Seq
     return found
 
 
-def _checked(name: str, prior: Any, table: ParameterNames) -> Any:
+def _checked(name: str, prior: Any, table: ParameterNames) -> Prior:
     interval = table.intervals[table.index(name)]
     if isinstance(prior, Normal | LogNormal):
         centre = prior.mean if isinstance(prior, Normal) else prior.median
@@ -86,6 +89,6 @@ def _checked(name: str, prior: Any, table: ParameterNames) -> Any:
     return low, high
 
 
-def is_finite(value: Any) -> bool:
+def is_finite(value: object) -> TypeGuard[float]:
     """True for a finite number."""
     return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)

@@ -5,7 +5,6 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
 
 from ..errors import ModelError
 
@@ -41,7 +40,7 @@ class Progress:
 class Watch:
     """Reports steps to a function, with times."""
 
-    def __init__(self, report: Callable[[Progress], Any], end: float):
+    def __init__(self, report: Callable[[Progress], object], end: float):
         self.report, self.end, self.began = report, end, time.perf_counter()
         self._seen: list[tuple[float, float]] = []  # seconds, and ln of what remains
 
@@ -56,7 +55,7 @@ class Watch:
         self.report(Progress(step, cost, chi2, remaining, now, left))
 
 
-def reporter(given: Any, end: float) -> Watch | None:
+def reporter(given: object, end: float) -> Watch | None:
     """The watch of a fit that ends where no more than `end` remains: None, True for lines of text, or a function."""
     if given is None or given is False:
         return None

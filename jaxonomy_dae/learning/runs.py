@@ -2,20 +2,23 @@
 for losses of one's own."""
 
 import dataclasses
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
+from ..aliases import PyTree
 from ..errors import InitializationError, ModelError, SimulationError, nearest
 from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
 from ..system.system import AcausalSystem
 from .objective import Objective
-from .program import Runs, Setting, placed, predict, run_end
+from .program import Runs, SensorLaw, Setting, placed, predict, run_end
 
 
-def run(objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
+def run(objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: np.ndarray | None = None) -> Solution:
     """An ordinary simulation of one experiment at a point."""
     layout, s = objective.layout, objective.stacked
     shared, own = objective.numbers(objective.coordinates.natural(z))
@@ -51,8 +54,12 @@ def why_not(objective: Objective) -> str:
 
 
 def residuals(
-    objective: Objective, model: AcausalSystem, starts: dict[str, Any], observe: dict[str, Any], adjoint: Any
-) -> dict[str, dict[str, Any]]:
+    objective: Objective,
+    model: AcausalSystem,
+    starts: Mapping[str, ArrayLike | Sequence[float]],
+    observe: Mapping[str, SensorLaw],
+    adjoint: PyTree,
+) -> dict[str, dict[str, Array]]:
     """As `Problem.residuals`: predictions of a model like the objective's less its data, in units of the noise."""
     layout, s = objective.layout, objective.stacked
     shared, own = objective.numbers(objective.coordinates.start)
@@ -66,7 +73,7 @@ def residuals(
         else:
             raise ModelError(f"the start of '{name}' is not unknown: " + nearest(name, layout.shared + layout.own))
     plain = dataclasses.replace(layout, parameters=(), modules=(), extra=())
-    setting = Setting(model, objective.observers | observe, plain, objective.setting.fine)
+    setting = Setting(model, {**objective.observers, **observe}, plain, objective.setting.fine)
     outputs = predict(setting, Runs(adjoint), shared, own, objective.conditions).values
     sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)
     scaled = jnp.where(s.observed, (outputs - s.values) / sigma, 0.0)

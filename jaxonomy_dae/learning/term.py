@@ -8,14 +8,15 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import sympy
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from ..aliases import Expression, Numeric
 from ..expressions.from_sympy import read
 from ..expressions.kernel import Kernel
 from ..model.opaque import AbstractReplacement
@@ -34,11 +35,11 @@ class Inner:
         """True if it is positive, and searched by its logarithm."""
         return self.range is None or self.range[0] > 0
 
-    def scaled(self, values: Any) -> Any:
+    def scaled(self, values: tuple[float, float]) -> np.ndarray:
         """Values on the scale of the search."""
         return np.log(values) if self.is_log else np.asarray(values)
 
-    def natural(self, x: Any) -> Any:
+    def natural(self, x: Numeric) -> Numeric:
         """The values that numbers on this scale stand for."""
         return jnp.exp(x) if self.is_log else x
 
@@ -57,11 +58,11 @@ class AbstractTerm(abc.ABC):
         return ()
 
     @abc.abstractmethod
-    def __call__(self, u: Float[Array, " inputs"], *inner: Any) -> Float[Array, " outputs"]:
+    def __call__(self, u: Float[Array, " inputs"], *inner: Float[Array, ""]) -> Float[Array, " outputs"]:
         """The values, for these numbers inside."""
 
     @abc.abstractmethod
-    def expressions(self, symbols: tuple[sympy.Symbol, ...], *inner: Any) -> tuple[sympy.Expr, ...]:
+    def expressions(self, symbols: tuple[sympy.Symbol, ...], *inner: sympy.Expr) -> tuple[sympy.Expr, ...]:
         """The term of each output, in symbols of the inputs."""
 
 
@@ -79,7 +80,7 @@ class Power(AbstractTerm):
         tail = {1: "", 2: f"*|{u}|"}.get(self.exponent, f"*|{u}|^{self.exponent - 1}")
         return u + tail
 
-    def __call__(self, u: Float[Array, " inputs"], *inner: Any) -> Float[Array, " inputs"]:
+    def __call__(self, u: Float[Array, " inputs"], *inner: Float[Array, ""]) -> Float[Array, " inputs"]:
         if self.exponent == 1:
             return u
         # Even powers of the length are polynomials; of odd ones, the root's derivative at rest is left out, as it is
@@ -90,7 +91,7 @@ class Power(AbstractTerm):
         length = jnp.where(away, jnp.sqrt(jnp.where(away, square, 1.0)), 0.0)
         return square**half * (length if odd else 1.0) * u
 
-    def expressions(self, symbols: tuple[sympy.Symbol, ...], *inner: Any) -> tuple[sympy.Expr, ...]:
+    def expressions(self, symbols: tuple[sympy.Symbol, ...], *inner: sympy.Expr) -> tuple[sympy.Expr, ...]:
         """In symbols of real numbers."""
         length = sympy.Abs(symbols[0]) if len(symbols) == 1 else sympy.sqrt(sympy.Add(*(s**2 for s in symbols)))
         return tuple(s * length ** (self.exponent - 1) for s in symbols)
@@ -115,14 +116,14 @@ class Written(AbstractTerm):
         """The free symbols of the expressions."""
         return self.numbers
 
-    def __call__(self, u: Float[Array, " inputs"], *inner: Any) -> Float[Array, " outputs"]:
+    def __call__(self, u: Float[Array, " inputs"], *inner: Float[Array, ""]) -> Float[Array, " outputs"]:
         values = _kernel(self.symbols, self.written)([*u, *inner])
         return jnp.stack([jnp.asarray(v, u.dtype) for v in values])
 
-    def expressions(self, symbols: tuple[sympy.Symbol, ...], *inner: Any) -> tuple[sympy.Expr, ...]:
+    def expressions(self, symbols: tuple[sympy.Symbol, ...], *inner: sympy.Expr) -> tuple[sympy.Expr, ...]:
         """The expressions with other symbols in place of the term's own."""
         other = dict(zip(self.symbols, (*symbols, *inner), strict=True))
-        written: tuple[Any, ...] = self.written  # SymPy says of nothing what it becomes
+        written: tuple[Expression, ...] = self.written  # SymPy says of nothing what it becomes
         return tuple(e.xreplace(other) for e in written)
 
 
@@ -131,7 +132,7 @@ class OfFunction(AbstractTerm):
     """A function of scalars, `function(x, y, …)`, for one of several outputs or for all."""
 
     label: str
-    function: Callable[..., Any]
+    function: Callable[..., ArrayLike]
     outputs: int
     output: int | None  # None: for all
 
@@ -140,11 +141,11 @@ class OfFunction(AbstractTerm):
         """Its own, with the output that it is for where there are several."""
         return self.label if self.output is None else f"{self.label}[{self.output}]"
 
-    def __call__(self, u: Float[Array, " inputs"], *inner: Any) -> Float[Array, " outputs"]:
+    def __call__(self, u: Float[Array, " inputs"], *inner: Float[Array, ""]) -> Float[Array, " outputs"]:
         value = jnp.atleast_1d(jnp.asarray(self.function(*u), u.dtype))
         return value if self.output is None else jnp.zeros(self.outputs, u.dtype).at[self.output].set(value[0])
 
-    def expressions(self, symbols: tuple[sympy.Symbol, ...], *inner: Any) -> tuple[sympy.Expr, ...]:
+    def expressions(self, symbols: tuple[sympy.Symbol, ...], *inner: sympy.Expr) -> tuple[sympy.Expr, ...]:
         """The term as an undefined function of SymPy."""
         if self.output is not None:
             whole = sympy.Function(self.label)(*symbols)
@@ -183,7 +184,7 @@ class ClosedForm(AbstractReplacement):
     inner: Float[Array, " inner"] = eqx.field(default_factory=lambda: jnp.zeros(0))
 
     @property
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, Numeric]:
         """The numbers inside the terms, by name."""
         return {one.name: one.natural(x) for one, x in zip(inner_of(self.terms), self.inner, strict=True)}
 

@@ -1,7 +1,7 @@
 """A fit under new data: what it predicts, and how well."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -44,7 +44,7 @@ class Unseen:
     root: Float[np.ndarray, "p r"]
 
     @classmethod
-    def of(cls, estimate: "Estimate", experiment: Any, first: int | None) -> "Unseen":
+    def of(cls, estimate: "Estimate", experiment: object, first: int | None) -> "Unseen":
         """An experiment with everything shared as it was found. Its own unknown starts are fitted to its `first`
         rows, or to all of them.
 
