@@ -32,6 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..programs.platform import platform
 from ..structure.tearing import Tearing
 from ..tolerances import TOLERATED, TOLERATED_NORM
 from . import dense
@@ -41,6 +42,7 @@ from .once import once
 from .written_out import UNROLLED
 
 APART = 8  # equations of a block from which on what its phases hand on is computed once, and not where it is read
+FORMS = 1024  # functions of forms of blocks that are kept: more than any model of the tests has, each of some kB
 CORRECTIONS = 2  # where an unknown of the sequence depends on another; else one is enough
 
 Entries = Mapping[tuple[int, int], Scalar]
@@ -59,9 +61,25 @@ def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[jax.Array]) ->
     **Returns:** the unknowns, in order; not-a-number where the residual is not small, or where nothing but rounding is
     left of the pivot of the tearing variable.
     """
-    numbers = {at: a for at, a in matrix.items() if not isinstance(a, jax.Array)}
     arrays = {at: a for at, a in matrix.items() if isinstance(a, jax.Array)}
-    n = len(right)
+    numbers = {at: a for at, a in matrix.items() if at not in arrays}
+    if not all(isinstance(a, int | float) for a in numbers.values()):
+        return _solver(tearing, numbers)(arrays, list(right))
+    return _traced_once(tearing, tuple(sorted(numbers.items())), platform())(arrays, list(right))
+
+
+Solver = Callable[[Entries, Sequence[jax.Array]], list[jax.Array]]
+
+
+@functools.lru_cache(maxsize=FORMS)
+def _traced_once(tearing: Tearing, numbers: tuple[tuple[tuple[int, int], float], ...], platform: str) -> Solver:
+    """A block is solved in dozens of places of a program: all call one function. XLA takes its calls apart again, but
+    what JAX traces, differentiates and lowers is one."""
+    return jax.jit(_solver(tearing, dict(numbers)))
+
+
+def _solver(tearing: Tearing, numbers: Mapping[tuple[int, int], Any]) -> Solver:
+    """The function (entries that are arrays, right-hand sides) → unknowns."""
 
     @jax.custom_jvp
     def solved(arrays, right):
@@ -74,6 +92,7 @@ def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[jax.Array]) ->
         still = {**numbers, **jax.lax.stop_gradient(arrays)}
         elimination = _Elimination(tearing, still, right[0])
         x = solved(arrays, right)
+        n = len(right)
         moved = [[right_dot[e]] for e in range(n)]
         for (e, u), a_dot in arrays_dot.items():
             moved[e].append(-(a_dot * x[u]))
@@ -92,7 +111,7 @@ def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[jax.Array]) ->
         )
         return x, _parts(x_dot)
 
-    return solved(arrays, list(right))
+    return solved
 
 
 def _parts(rows: jax.Array) -> list[jax.Array]:
