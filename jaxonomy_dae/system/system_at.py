@@ -68,12 +68,19 @@ class SystemAt:
             self._last = (x, tuple(entries(array)) if self.plan.n_state <= SCALARS else array)
         return self._last[1]
 
-    def _read(self, evaluation: Evaluation, gather: Gather) -> Array:
-        """Gathered values as an array; those of a small system one by one, which XLA fuses."""
-        n = len(gather.chunk)
-        if not 0 < n <= SCALARS or self.plan.n_state > SCALARS:
+    def _values(self, evaluation: Evaluation, gather: Gather) -> Chunk:
+        """Gathered values: those of a small system one by one, which XLA fuses, else as an array."""
+        if self.plan.n_state > SCALARS:
             return self._filled(evaluation, gather)
-        return jnp.stack([jnp.asarray(evaluation.read(gather.only(k)), self.dtype) for k in range(n)])
+        return tuple(jnp.asarray(evaluation.read(gather.only(k)), self.dtype) for k in range(len(gather.chunk)))
+
+    def _array(self, *chunks: Chunk) -> Array:
+        """All values of these chunks. Scalars are put together once, at the end: in a batch, XLA makes no vector loop
+        of an array that is made of arrays, and computes its entries one by one."""
+        if all(isinstance(chunk, tuple) for chunk in chunks):
+            values = [value for chunk in chunks for value in chunk]
+            return jnp.stack(values) if values else jnp.zeros(0, self.dtype)
+        return jnp.concatenate([self._array(chunk) if isinstance(chunk, tuple) else chunk for chunk in chunks])
 
     # --- vector field ------------------------------------------------------------------------------------------
 
@@ -81,51 +88,56 @@ class SystemAt:
         """d(state)/dt, shape (n_state,)."""
         plan = self.plan
         if not len(plan.carried):
-            return self._slopes(x)[0]
+            return self._array(self._slopes(x)[0])
         x = self.refined(x, Refinement.ONCE)
         slopes, evaluation = self._slopes(x)
         if plan.carried_rates is not None:
-            return jnp.concatenate([slopes, self._read(evaluation, plan.carried_rates)])
-        return jnp.concatenate([slopes, self._carried_rates(x, slopes)])
+            return self._array(slopes, self._values(evaluation, plan.carried_rates))
+        return self._array(slopes, self._carried_rates(x, slopes))
 
     def semi_explicit(self, x: Array) -> Array:
         """dx/dt of the states, then the residuals of nonlinear blocks, at the state as it is: shape (n_state,)."""
-        slopes, _ = self._slopes(x)
+        slopes = self._array(self._slopes(x)[0])
         return jnp.concatenate([slopes, self.carried_vector(self.t, x)]) if len(self.plan.carried) else slopes
 
-    def _slopes(self, x: Array) -> tuple[Array, Evaluation]:
+    def _slopes(self, x: Array) -> tuple[Chunk, Evaluation]:
         """dx/dt of the differential states, and all that was computed on the way."""
         plan = self.plan
         evaluation = self.run(plan.derivative, x, Refinement.NONE)
-        slopes = self._read(evaluation, plan.next_derivative)
+        slopes = self._values(evaluation, plan.next_derivative)
         for row in plan.rows:
-            slopes = slopes + self._correction(row, evaluation)
+            slopes = self._corrected(slopes, row, evaluation)
         return slopes, evaluation
 
-    def _correction(self, row: PlannedRow, evaluation: Evaluation) -> Array:
-        """What a network adds to the slopes."""
+    def _corrected(self, slopes: Chunk, row: PlannedRow, evaluation: Evaluation) -> Chunk:
+        """The slopes with what a network adds to them."""
         read = iter(row.inputs)
         u = [
             self.t if k in row.opaque.time_positions else jnp.asarray(evaluation.read(next(read)), self.dtype)
             for k in range(row.opaque.n_inputs)
         ]
         out = row.opaque(self.networks[row.opaque.index], self.t, jnp.stack(u))
+        added = out[: len(row.rows)] / jnp.asarray(row.factor, self.dtype)
+        if isinstance(slopes, tuple):
+            more = dict(zip(row.rows, entries(added), strict=True))
+            return tuple(slope + more[k] if k in more else slope for k, slope in enumerate(slopes))
         place = np.full(len(self.plan.states), -1)  # nothing is added to other slopes: the last entry, zero
         place[list(row.rows)] = np.arange(len(row.rows))
-        return jnp.append(out[: len(row.rows)] / jnp.asarray(row.factor, self.dtype), 0.0)[place]
+        return slopes + jnp.append(added, 0.0)[place]
 
-    def _carried_rates(self, x: Array, slopes: Array) -> Array:
+    def _carried_rates(self, x: Array, slopes: Chunk) -> Chunk:
         """dz/dt = −(∂g/∂z)⁻¹ (∂g/∂t + ∂g/∂x dx/dt) for the tearing variables z of nonlinear blocks."""
         plan = self.plan
         n, m = len(plan.states), len(plan.carried)
 
-        def along(rates: Array) -> Array:
-            moved = jnp.ones_like(self.t), jnp.concatenate([slopes, rates])
-            return jax.jvp(self.carried_vector, (self.t, x), moved)[1]
+        def along(rates: Chunk) -> Array:
+            each = rates if isinstance(rates, tuple) else entries(rates)
+            moved = (*slopes, *each) if isinstance(slopes, tuple) else self._array(slopes, rates)
+            return jax.jvp(self.carried_vector, (self.t, self._chunk(x)), (jnp.ones_like(self.t), moved))[1]
 
         if plan.carried_pattern is None:
-            _, rates = newton_step(lambda rates: entries(along(jnp.stack(rates))), [jnp.zeros((), self.dtype)] * m)
-            return jnp.stack(rates)
+            _, rates = newton_step(lambda rates: entries(along(tuple(rates))), [jnp.zeros((), self.dtype)] * m)
+            return tuple(rates)
         matrix = sparse_jacobian(lambda z: self.carried_vector(self.t, jnp.append(x[:n], z)), plan.carried_pattern)(
             x[n:]
         )
@@ -197,7 +209,8 @@ class SystemAt:
         plan = self.plan
         evaluation = self.run(plan.carried_residuals, x, refine)
         gather = plan.carried_residuals.layout.gather(plan.carried)
-        return jnp.concatenate([x[: len(plan.states)], self._read(evaluation, gather)])
+        own = self._chunk(x)[: len(plan.states)]
+        return self._array(own, self._values(evaluation, gather))
 
     # --- constraints -------------------------------------------------------------------------------------------
 
