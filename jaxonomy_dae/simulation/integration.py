@@ -72,13 +72,13 @@ class Outcome(eqx.Module):
     found: InitialPoint
     ts: Times
     x: State
-    last: tuple[Time, State]
+    last: tuple[Any, Any]
     stats: dict[str, PyTree]
     result: Result
     is_stiff: Array
-    discrete: Array | None = None
+    discrete: Any = None
     events: EventLog | None = None
-    held: Array | None = None  # the discrete values at the last accepted point
+    held: Any = None  # the discrete values at the last accepted point
     memory: Memory | None = None
 
     def numbers(self) -> dict[str, PyTree]:
@@ -130,7 +130,7 @@ class _Rows(NamedTuple):
     discrete: Array | None
     memory: Memory | None
     filled: Array
-    last: tuple[Time, State]
+    last: tuple[Any, Any]
     okay: Array
 
 

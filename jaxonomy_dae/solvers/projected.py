@@ -1,6 +1,7 @@
 """Projection after every step, for any Diffrax solver."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,12 +9,12 @@ import jax.numpy as jnp
 from diffrax import AbstractSolver
 from diffrax import AbstractWrappedSolver as _Wrapped
 
-from ..aliases import Args, Numeric, State, Time
+from ..aliases import Numeric
 from ..errors import ModelError
 from .choice_guard import ChoiceGuard
 from .wrapped import WrappedSolver
 
-Projection = Callable[[Time, State, Args], State]
+Projection = Callable[[Any, Any, Any], Any]
 
 
 class Projected(WrappedSolver):
