@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, AcausalSystem, EqnEnv, StructuralError, simulate
 from jaxonomy_dae.modelica import FlatComponent, load
 
 SECONDS, MEMORY = 120, 4 << 30  # of one file's process: time of the processor, bytes of memory beside XLA's code
@@ -131,11 +131,10 @@ def _stages(file: Path, references: Path, gradients: bool, row: dict, roots: Seq
     yield "read"
     names, data = _reference(file.stem, references)
     changing = {d.name for d in flat.model.declarations if not d.prefixes & {"parameter", "constant"}}
-    ev, diagram = EqnEnv(), AcausalDiagram()
-    component = FlatComponent(ev, "m", flat, outputs=[n for n in names if n in changing])
-    diagram.add(component)
+    outputs = [n for n in names if n in changing]
+    component = FlatComponent(EqnEnv(), "m", flat, outputs)
     yield "translated"
-    system = AcausalCompiler(ev, diagram, prefer_states=[f"m.{v}" for v in flat.preferred_states])()
+    component, system = _compiled(component, outputs)
     row["equations"], row["states"] = system.plan.flat.n_equations, len(system.states)
     yield "compiled"
     said = flat.experiment
@@ -168,6 +167,23 @@ def _stages(file: Path, references: Path, gradients: bool, row: dict, roots: Seq
             yield "gradient"
         else:
             row["error"] = f"the gradient is off by {row['gradient']:.3g}"
+
+
+def _compiled(component: FlatComponent, outputs: list[str]) -> tuple[FlatComponent, AcausalSystem]:
+    """The model. Parameters of zero for which an equation determines nothing are written as numbers."""
+    numbers: list[str] = []
+    preferred = [f"m.{v}" for v in component.flat.preferred_states]
+    while True:
+        diagram = AcausalDiagram()
+        diagram.add(component)
+        try:
+            return component, AcausalCompiler(component.ev, diagram, prefer_states=preferred)()
+        except StructuralError as error:
+            zeros = re.findall(r"m\.(\S+) = 0[,:]", str(error)) if "determines nothing for" in str(error) else []
+            if not set(zeros) - set(numbers):
+                raise
+            numbers += zeros
+            component = FlatComponent(EqnEnv(), "m", component.flat, outputs, numbers)
 
 
 def _reference(stem: str, references: Path):

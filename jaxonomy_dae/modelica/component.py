@@ -25,6 +25,8 @@ class FlatComponent(Component):
     - `flat`: the model, as `load` returns it.
     - `outputs`: names of Boolean and Integer variables that the solution shall contain. It always contains those that a
         `when` assigns or `pre(…)` reads.
+    - `numbers`: names of parameters that are written as their values, so that they cannot be changed. A resistance of
+        zero makes two potentials one; as a parameter it would have to determine a current, which the compiler refuses.
 
     **Raises:**
 
@@ -32,10 +34,17 @@ class FlatComponent(Component):
         or `flat.add_term`, of a variable that is not defined by exactly one equation of the form `variable = …`.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, flat: FlatModel, outputs: Sequence[str] = ()):
+    def __init__(
+        self, ev: EqnEnv, name: str, flat: FlatModel, outputs: Sequence[str] = (), numbers: Sequence[str] = ()
+    ):
         super().__init__(ev, name)
         self.flat = flat
-        scope = Scope(flat, self)
+        scope = Scope(flat, self, frozenset(numbers))
+        for number in numbers:
+            if number not in scope.declared or "parameter" not in scope.declared[number].prefixes:
+                raise ModelError(
+                    f"numbers: '{flat.name}' has no parameter '{number}': {nearest(number, scope.declared)}"
+                )
         found = scope.definitions
         scope.declare_variables()
         replaced = {variable: equation_of(scope, variable) for variable in flat.laws}

@@ -7,7 +7,7 @@ event are discrete variables; the others are expressions, put in wherever they a
 
 import functools
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import TypeVar
 
 import sympy
@@ -33,6 +33,7 @@ _CONSTANT = {"parameter", "constant"}
 class Scope:
     """The names of a flat model that is being written into a component.
 
+    - `numbers`: parameters whose values are numbers.
     - `interpreter`: evaluates expressions in these names.
     - `definitions`: which statement determines which variable.
     - `kept`: relations whose truth is kept between events.
@@ -45,8 +46,8 @@ class Scope:
       condition is false.
     """
 
-    def __init__(self, flat: FlatModel, component: Component):
-        self.flat, self.component = flat, component
+    def __init__(self, flat: FlatModel, component: Component, numbers: Collection[str] = ()):
+        self.flat, self.component, self.numbers = flat, component, numbers
         self.kept = KeptRelations(component)
         self.declared = {d.name: d for d in flat.model.declarations}
         self.known: dict[str, Value] = {"time": component.ev.t}
@@ -184,7 +185,7 @@ class Scope:
             return value
         if isinstance(value, int | float):
             value = float(value)
-            if self.as_numbers:
+            if self.as_numbers or d.name in self.numbers:
                 return value
         elif not isinstance(value, sympy.Expr):
             return value
