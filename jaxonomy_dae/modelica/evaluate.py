@@ -12,6 +12,7 @@ from ..modeling.symbols import VariableSymbol, der
 from .builtin import FUNCTIONS, matrix_product
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
+from .read_base import FUNCTION
 from .tree import (
     Array,
     Binary,
@@ -249,12 +250,19 @@ class Evaluator:
             return self.special[name](*e.arguments)
         if name in ("noEvent", "smooth"):
             return self._without_events(e, names)
+        if name == FUNCTION:
+            return self._applied(e.arguments[0], names)
         if name == "der":
             return entrywise(der, self.evaluate(e.arguments[0], names))
         arguments = [self.evaluate(a, names) for a in e.arguments]
         named = {k: self.evaluate(v, names) for k, v in e.named}
         if name in FUNCTIONS:
             return FUNCTIONS[name](*arguments, **named)
+        if name not in self.classes and "." not in name:
+            try:
+                return names(name)(*arguments, **named)
+            except KeyError:
+                pass
         return self.call(name, arguments, named)
 
     def _without_events(self, e: Call, names: Names) -> Value:
@@ -268,6 +276,13 @@ class Evaluator:
         if is_condition(value) and not isinstance(value, bool):
             self.quieted.add(value)
         return value
+
+    def _applied(self, e: Expression, names: Names) -> Value:
+        """A function as an argument, with those of its arguments that are given."""
+        if not isinstance(e, Call):
+            raise ModelError("a function as an argument has its arguments in parentheses")
+        given = {k: self.evaluate(v, names) for k, v in e.named}
+        return lambda *arguments, **more: self.call(e.function, list(arguments), given | more)
 
     def call(self, name: str, arguments: list[Value], named: dict[str, Value]) -> Value:
         """The results of a function that is not built in."""

@@ -14,11 +14,12 @@ from .left_out import LEFT_OUT
 from .library import Library
 from .read_base import read_base, read_modifiers
 from .read_rumoca import read_rumoca
+from .roots import ROOT
 
 _PLACE = re.compile(r"× (?P<what>[^\n]*)\s+╭─\[[^\]]*?:(?P<line>\d+):(?P<column>\d+)\]")
 _UNRESOLVED = re.compile(r"unresolved (type reference|function call|component reference|[\w ]+): '([^']+)'")
 _UNBALANCED = re.compile(r"unbalanced model: (\d+) equations, (\d+) unknowns")
-DEFINED = frozenset(LEFT_OUT)  # functions that texts need not hold
+DEFINED = frozenset({*LEFT_OUT, ROOT})  # functions that texts need not hold
 _CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")
 
 

@@ -47,6 +47,7 @@ _LEVEL = {  # binary operators, and how strongly they bind
     "+": 5, "-": 5, ".+": 5, ".-": 5, "*": 6, "/": 6, ".*": 6, "./": 6, "^": 7, ".^": 7,
 }  # fmt: skip
 _NOT, _SUM, _POWER = 3, 5, 7
+FUNCTION = "function"  # marks an argument that is a function of which some arguments are given
 INSIDE = "[\\'"  # a quoted name with names in its subscripts
 _QUOTED = r"'(?:[^'\\]|\\.)*'"
 _PART = re.compile(rf"([^\[\]]+)(?:\[((?:{_QUOTED}|\[(?:{_QUOTED}|[^\[\]'])*\]|[^\[\]'])*)\])?\.?")
@@ -293,7 +294,8 @@ class Reader:
         return tuple(arguments), tuple(named)
 
     def _argument(self) -> Expression:
-        self.take("function")
+        if self.take("function"):
+            return Call(FUNCTION, (self.expression(),), ())
         value = self.expression()
         return Comprehension(value, self._iterators()) if self.take("for") else value
 

@@ -21,6 +21,7 @@ from .interpret import Interpreter
 from .kept_relations import KeptRelations
 from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
+from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, LINEAR, SMOOTHNESS
 from .tree import Assignment, Branches, Declaration, Equality, Expression, Reference, Truth
 from .values import Record, Value, as_number, both, is_condition, negated, plain
@@ -61,7 +62,7 @@ class Scope:
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
         self.random = RandomNumbers(component)
         self.interpreter = Interpreter(
-            flat.classes, self.value, special, LEFT_OUT | EXTERNALS | self.random.functions(),
+            flat.classes, self.value, special, LEFT_OUT | EXTERNALS | self.random.functions() | {ROOT: self._root},
             self.entries, self._named,
         )  # fmt: skip
         self.definitions = find_definitions(flat.model, self.is_discrete)
@@ -332,6 +333,9 @@ class Scope:
             self.names[e] = self.component.variable(name)
             self.component.add_equations(sympy.Eq(self.names[e], self.kept.in_equations(e), evaluate=False))
         return self.names[e]
+
+    def _root(self, *arguments: Value) -> Value:
+        return root(self.component, self.interpreter.guards, *arguments)
 
     def _table(self, name: str, place: int, *arguments: Expression) -> Value:
         """A table. The entries of a smooth one, whose polynomials depend on all of them, are numbers."""

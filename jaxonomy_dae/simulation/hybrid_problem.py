@@ -1,7 +1,6 @@
 """A compiled system as a problem with events."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,6 +25,8 @@ RESTART = 8  # Gauss–Newton steps onto the constraints after an event; from 1e
 # Contacts are exchanged at most this many times, for each of them, while one impact is resolved. If an impulse would
 # still have to pull, the event fails.
 TRIES = 4
+
+_Point = tuple[Time, State, Array, Args]  # time, states, discrete values, and what equations get beside these
 
 
 class SystemProblem(AbstractHybridProblem):
@@ -88,7 +89,7 @@ class SystemProblem(AbstractHybridProblem):
         )
         return jnp.where(new > -jnp.inf, new, q)
 
-    def struck(self, t: Time, x: State, before: Array, q: Any, args: Args) -> tuple[Any, Any, Any]:
+    def struck(self, t: Time, x: State, before: Array, q: Array, args: Args) -> tuple[Array, Array, Array]:
         """Applies the impulses of the constraints that begin to hold with q, or that q asks for. Returns (x, q, whether
         the impulses do what they should).
 
@@ -101,8 +102,9 @@ class SystemProblem(AbstractHybridProblem):
         have energies, as of independent contacts; from those that were closed, so that one that repeats others never
         acts).
         """
-        plan: Any = self.system.plan
+        plan = self.system.plan
         held, n = plan.held, len(plan.states)
+        assert held is not None
         place, pushes = held.table.impulse, held.table.closed >= 0
         closed = held.table.closed[pushes]
         held_before, _ = self.system.holding(before).at(t, args).held(x)
@@ -110,8 +112,9 @@ class SystemProblem(AbstractHybridProblem):
         e = levels[held.last]
         strength = jnp.where(q[place] == 0, holds * (1 - held_before), q[place])
 
-        def jump(problem: SystemProblem, t: Time, acting: Array, x: State, q: Any, strength: Array, args: Args) -> Any:
+        def jump(problem: SystemProblem, point: _Point, acting: Array, strength: Array) -> tuple[Array, ...]:
             """(q with the contacts that act, the states after their impulses, these, e⁺)."""
+            t, x, q, args = point
             system = problem.system
             q = q.at[closed].set(jnp.where(acting[pushes], q[closed], 0.0))
             strength = jnp.where(acting, strength, 0.0)
@@ -127,33 +130,30 @@ class SystemProblem(AbstractHybridProblem):
 
         acting, wrong = jnp.ones(len(pushes), bool), jnp.zeros((), bool)
         if len(pushes) > 1 and pushes.any():
-            strikes = pushes & (strength > 0)
-            may_change = strikes | (pushes & (holds > 0))
-            acting, wrong = self._acting(jump, t, x, q, strength, e, strikes, may_change, args)
-        q, after, _, left = jump(self, t, acting, x, q, strength, args)
+            strikes = jnp.asarray(pushes) & (strength > 0)
+            may_change = strikes | (jnp.asarray(pushes) & (holds > 0))
+            acting, wrong = self._acting(jump, (t, x, q, args), strength, e, strikes, may_change)
+        q, after, _, left = jump(self, (t, x, q, args), acting, strength)
         done = jnp.abs(left - (1 - strength) * e) <= LEFT * jnp.abs(strength * e)
         return after, q, jnp.all(done | (strength == 0) | ~acting) & ~wrong
 
     def _acting(
         self,
-        jump: Callable[..., Array],
-        t: Time,
-        x: State,
-        q: Array,
+        jump: Callable[..., tuple[Array, ...]],
+        point: _Point,
         strength: Array,
         e: Array,
         strikes: Array,
         may_change: Array,
-        args: Args,
     ) -> tuple[Array, Array]:
         """Which contacts act, and whether that could not be found; not differentiated."""
-        problem, t, x, q, strength, e, args = still(constant_once((self, t, x, q, strength, e, args)))
+        problem, point, strength, e = still(constant_once((self, point, strength, e)))
         n = len(may_change)
         speed = PULL * jnp.max(jnp.abs(strength * e), initial=0.0)
 
         def exchanged(carry):
             acting, _, count = carry
-            _, _, pushed, after = jump(problem, t, acting, x, q, strength, args)
+            _, _, pushed, after = jump(problem, point, acting, strength)
             pulls = acting & (pushed < -PULL * jnp.max(jnp.abs(pushed)))
             meets = ~acting & (after - (1 - strength) * e < -speed)
             wrong = may_change & (pulls | meets)

@@ -72,13 +72,13 @@ class Outcome(eqx.Module):
     found: InitialPoint
     ts: Times
     x: State
-    last: tuple[Any, Any]
+    last: tuple[Time, State]
     stats: dict[str, PyTree]
     result: Result
     is_stiff: Array
-    discrete: Any = None
+    discrete: Array | None = None
     events: EventLog | None = None
-    held: Any = None  # the discrete values at the last accepted point
+    held: Array | None = None  # the discrete values at the last accepted point
     memory: Memory | None = None
 
     def numbers(self) -> dict[str, PyTree]:
@@ -130,7 +130,7 @@ class _Rows(NamedTuple):
     discrete: Array | None
     memory: Memory | None
     filled: Array
-    last: tuple[Any, Any]
+    last: tuple[Time, State]
     okay: Array
 
 

@@ -10,9 +10,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..adjoint.stored_adjoint import default_adjoint
-from ..aliases import Args, Controller, Solver, Time, Times, Tolerance
+from ..aliases import Args, Controller, PyTree, Solver, State, Time, Times, Tolerance
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..initialization.check import check
 from ..initialization.initialize import InitialPoint, known_start, search_outside
@@ -382,7 +383,11 @@ class _Call:
         return is_stiff(decay, float(self.given.t1 - outcome.last[0]), self.max_steps)
 
     def _solution(
-        self, outcome: Outcome, counts: dict[str, Any], saved: tuple[Any, Any, Any], memory: Memory | None
+        self,
+        outcome: Outcome,
+        counts: dict[str, PyTree],
+        saved: tuple[Times, State, Array | None],
+        memory: Memory | None,
     ) -> Solution:
         ts, states, discrete = saved
         return Solution(

@@ -1,7 +1,6 @@
 """Why steps become many or small at a point: a jump, a finite escape, stiffness, values that do not exist beyond."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from .index_one import consistent_slope
 
 LARGE = 300  # unknowns up to which eigenvalues are looked at: they cost n³, some 0.1 s at 300
 NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
-Slope = Callable[[Any, Any], Float[Array, " n"]]
+Slope = Callable[[Time, Array], Float[Array, " n"]]
 
 
 def cause_of(

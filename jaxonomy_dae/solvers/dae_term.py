@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -15,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from ..aliases import Args, PyTree, State, Terms, Time
 from ..errors import ModelError
 from ..linear.mass import Mass
+from ..linear.sparse import SparsePattern
 from ..private_names import unwrapped
 
 
@@ -42,9 +42,9 @@ class DAETerm(diffrax.AbstractTerm):
     field: Callable[..., State]
     constraint: Callable[..., State] | None = None
     mass: Mass | None = eqx.field(static=True, default=None)
-    pattern: Any = eqx.field(static=True, default=None)
+    pattern: SparsePattern | None = eqx.field(static=True, default=None)
 
-    def __init__(self, field, constraint=None, *, mass: PyTree = None, pattern: Any = None):
+    def __init__(self, field, constraint=None, *, mass: PyTree = None, pattern: SparsePattern | None = None):
         if not callable(field) or (constraint is not None and not callable(constraint)):
             raise ModelError("a DAETerm is made of functions: DAETerm(f, g), or DAETerm(F, mass=M)")
         if constraint is not None and mass is not None:

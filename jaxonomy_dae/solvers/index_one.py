@@ -1,7 +1,6 @@
 """What index 1 means for a solver: a slope at a consistent point, and a way back to one."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,7 @@ SURE = 1e-6  # steps so small are taken whole: rounding, not curvature, decides 
 
 def index_matrix(
     problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Float[ArrayLike, ""], y: Float[Array, " n"]
-) -> tuple[LinearAlgebra, Float[Array, " n"], Any, Any]:
+) -> tuple[LinearAlgebra, Float[Array, " n"], Array, Array]:
     """(linear algebra, F, ∂F/∂y, M − P ∂F/∂y): with P the projector onto the algebraic equations, the last is regular
     if and only if the index is 1."""
     chosen = choose(linear, y.shape[0], problem.pattern, problem.mass)

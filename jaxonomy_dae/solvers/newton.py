@@ -1,7 +1,7 @@
 """The modified Newton iteration of an implicit step, and its derivative."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,7 +29,7 @@ class Tolerances(eqx.Module):
     atol: Tolerance = FROM_CONTROLLER
     norm: PyTree = FROM_CONTROLLER
 
-    def values(self, dtype: DTypeLike) -> tuple[Any, Any, Callable[[Any], Any]]:
+    def values(self, dtype: DTypeLike) -> tuple[Array, Array, Callable[[PyTree], Array]]:
         """(rtol, atol flat, norm)."""
         if self.rtol is FROM_CONTROLLER:
             raise ModelError(

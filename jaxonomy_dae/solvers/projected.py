@@ -1,7 +1,6 @@
 """Projection after every step, for any Diffrax solver."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,12 +8,12 @@ import jax.numpy as jnp
 from diffrax import AbstractSolver
 from diffrax import AbstractWrappedSolver as _Wrapped
 
-from ..aliases import Numeric
+from ..aliases import Args, Numeric, State, Time
 from ..errors import ModelError
 from .choice_guard import ChoiceGuard
 from .wrapped import WrappedSolver
 
-Projection = Callable[[Any, Any, Any], Any]
+Projection = Callable[[Time, State, Args], State]
 
 
 class Projected(WrappedSolver):
