@@ -3,6 +3,7 @@
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jax import Array
 
 from .errors import ModelError
 from .optional import QUANTITIES, Axes, axis_label, legend_beside, new_axes, optional_module, pyplot
@@ -22,7 +23,7 @@ class Response(Protocol):
     """A `FrequencyResponse`, as its figures read it: by pairs (output, input)."""
 
     @property
-    def omega(self) -> Any:
+    def omega(self) -> Array:
         """Angular frequencies (rad/s), shape (k,)."""
         ...
 

@@ -11,14 +11,13 @@ the events of conditions, one after the other, and stay as they are while the st
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..aliases import Args, Time
+from ..aliases import Args, Numeric, Time
 from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale
 from ..modeling.events import EventFlag
@@ -191,7 +190,7 @@ def _written(system: AcausalSystem, t: Time, inputs: Args, x: Array, q: Array) -
     return values, now
 
 
-def guard_rounding(system: AcausalSystem, here: Any, x: Any) -> Any:
+def guard_rounding(system: AcausalSystem, here: Numeric, x: Numeric) -> Array:
     """The distance from zero that a guard may have by what is left of the equations at an equilibrium, shape
     (guards,)."""
     plan = system.plan

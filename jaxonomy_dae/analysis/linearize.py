@@ -213,7 +213,7 @@ def _check_inputs(system: AcausalSystem, names: list[str], given: Mapping[str, o
             )
 
 
-def _value_at(system: AcausalSystem, values: Mapping[str, Any], name: str, t: Time) -> Array:
+def _value_at(system: AcausalSystem, values: Mapping[str, object], name: str, t: Time) -> Array:
     table = system.plan.inputs
     value = values.get(name, table.defaults[table.names.index(name)])
     return jnp.asarray(value_at(value, t), t.dtype)

@@ -73,7 +73,7 @@ class OperatingPoint(eqx.Module):
         """The states by name: `simulate(point.system, t1, initial=point.start)` continues from here."""
         return {name: self.x[..., k] for k, name in enumerate(self.system.states)}
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, np.ndarray]:
         """All variables by name."""
         names = self.system.variables
         return dict(zip(names, jnp.moveaxis(self[names], -1, 0), strict=True))

@@ -7,7 +7,7 @@ equations choose (`complementary`) are changed, few at once, and it all begins a
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +52,7 @@ class _Search(NamedTuple):
     modes: Array
     rounds: Array
     before: tuple[Point, Array]
-    first: tuple[Point, Root, Any]
+    first: tuple[Point, Root, Array]
     goes_on: Array
 
 

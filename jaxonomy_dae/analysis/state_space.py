@@ -53,7 +53,7 @@ class StateSpace(eqx.Module):
         slowness = found.real if self.dt is None else jnp.abs(found)
         return found[jnp.lexsort((found.imag, -found.real, -slowness))]
 
-    def frequency_response(self, omega: Any) -> FrequencyResponse:
+    def frequency_response(self, omega: object) -> FrequencyResponse:
         """The response to sinusoids, C·(jω − A)⁻¹·B + D. A discrete-time model has exp(jω·dt) in place of jω, and
         responds from samples of inputs to samples of outputs.
 
@@ -129,7 +129,7 @@ class StateSpace(eqx.Module):
             counts.append("from tick to tick")
         return f"StateSpace({', '.join(counts)})"
 
-    def _tables(self) -> list[tuple[str, Any, tuple[str, ...], tuple[str, ...]]]:
+    def _tables(self) -> list[tuple[str, object, tuple[str, ...], tuple[str, ...]]]:
         tables = [
             ("A", self.A, self.states, self.states),
             ("B", self.B, self.states, self.inputs),

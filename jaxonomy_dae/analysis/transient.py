@@ -7,7 +7,6 @@ controller is not saturated.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +21,7 @@ NEAR = 1e-3  # of slopes at the start: then Newton's method does the rest
 
 
 def pseudo_transient(
-    function: Callable[[Any], Any], mass: Float[Array, " n"], start: Float[Array, " n"], unit: Float[Array, " n"]
+    function: Callable[[Array], Array], mass: Float[Array, " n"], start: Float[Array, " n"], unit: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """A point near the equilibrium of mass·dx/dt = F(x) that a start leads to, or where the steps end; `unit` are sizes
     of the unknowns."""

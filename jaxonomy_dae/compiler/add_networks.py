@@ -2,10 +2,10 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
+from ..aliases import PyTree
 from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction, OpaqueTemplate
 from ..model.provenance import Provenance, Provenances, Written
@@ -67,7 +67,7 @@ def add_corrections(
     diagram: AcausalDiagram,
     variables: VariableTable,
     groups: tuple[EquationGroup, ...],
-    networks: dict[str, Any],
+    networks: dict[str, PyTree],
 ) -> tuple[VariableTable, tuple[EquationGroup, ...], tuple[RowInjection, ...]]:
     """Adds the learned corrections.
 
@@ -105,7 +105,7 @@ def add_corrections(
 
 
 def _corrections(
-    model: ModelNumbers, diagram: AcausalDiagram, variables: VariableTable, groups, networks: dict[str, Any]
+    model: ModelNumbers, diagram: AcausalDiagram, variables: VariableTable, groups, networks: dict[str, PyTree]
 ) -> list[_Correction]:
     """The corrections of the diagram, whose functions are added to `networks`."""
     names, known = variables.names, variables.index if diagram.blocks else {}

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Hashable, Sequence
 from fractions import Fraction
-from typing import Any
 
 import sympy
 from sympy.codegen import cfunctions
@@ -229,7 +228,7 @@ _NAMED = {
     cfunctions.hypot: "hypot",
 }
 
-_WRITTEN: dict[Any, Callable[..., Node]] = {
+_WRITTEN: dict[object, Callable[..., Node]] = {
     sympy.Add: add,
     sympy.Mul: product,
     sympy.Pow: raised,

@@ -110,12 +110,12 @@ class HybridState(AbstractAppending):
     table: EventRows | None
 
     @classmethod
-    def of(cls, x: State, q: Array, table: EventRows | None, **parts: Any) -> "HybridState":
+    def of(cls, x: State, q: Array, table: EventRows | None, **parts: Array) -> "HybridState":
         """A state of all its parts."""
         packed = {field: jnp.stack([parts[name] for name in names]) for field, names in _PARTS.items()}
         return cls(x=x, q=q, table=table, **packed)
 
-    def but(self, **changes: Any) -> "HybridState":
+    def but(self, **changes: Array) -> "HybridState":
         """A copy with the named parts replaced."""
         whole = {name: changes.pop(name) for name in ("x", "q") if name in changes}
         for field, names in _PARTS.items():
@@ -157,7 +157,7 @@ class HybridTerm(diffrax.AbstractTerm):
     def vf(self, t: Time, y: HybridState, args: Args) -> State:
         return self.problem.field(t, y.x, y.q, args)
 
-    def contr(self, t0: Time, t1: Time, **kwargs: Any) -> Any:
+    def contr(self, t0: Time, t1: Time, **kwargs: object) -> object:
         return t1 - t0
 
     def prod(self, vf: State, control: Time) -> State:

@@ -1,7 +1,7 @@
 """Where a run with events begins."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -112,7 +112,7 @@ def _beyond_doubt(size: Array) -> Array:
 
 def _settled(
     problem: AbstractHybridProblem, t0: Time, x0: State, q0: Array, due: Array, args: Args, resumed: Resumed | None
-) -> tuple[Any, Any, Any]:
+) -> tuple[Array, Array, Array]:
     """Settles the relations at the initial time: each gets the truth of its sides, or, if its clock is `due`, what that
     writes; of a run that is `resumed`, one whose sides are equal keeps its truth. Returns (q, rates of the guards,
     values of the guards); q does not move with parameters."""

@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
+from jax.typing import ArrayLike
 
 PASSES = 10  # each halves, in logarithms, how far the largest entries are from one (Ruiz 2001): a thousandth is left
 LARGEST_EXPONENT = 300.0  # of ten, for a scale
 
 
-def geometric_scales(matrix: Any) -> tuple[np.ndarray, np.ndarray]:
+def geometric_scales(matrix: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """r and c for which the logarithms of the entries of diag(r)·A·diag(c) are nearest to zero (Curtis & Reid 1972).
 
     Matrices that differ by scalings of rows and columns alone come out equal, however far apart the scales are. Small

@@ -62,7 +62,7 @@ def sparse_rank_of(matrix: Any, errors: Any) -> SparseRank:
     return first if first.is_regular and not second.condition < first.condition else second
 
 
-def _factored(matrix: Any, errors: Any, scales: Callable) -> SparseRank:
+def _factored(matrix: object, errors: object, scales: Callable) -> SparseRank:
     linalg: Any = scipy.sparse.linalg
     scaled, r, c = scales(matrix)
     scaled = sp.csc_array(scaled)

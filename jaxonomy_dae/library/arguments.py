@@ -60,7 +60,7 @@ def row(values: Sequence[Value] | np.ndarray, name: str, what: str) -> list[Valu
     return list(values)
 
 
-def count(value: Any, name: str, what: str) -> int:
+def count(value: object, name: str, what: str) -> int:
     """A positive integer.
 
     **Raises:**

@@ -104,9 +104,9 @@ def one_by_one(arrays: ArrayNames, names: list[str], initial: object) -> Any:
     """
     if not isinstance(initial, Mapping) or not arrays.entries:
         return initial
-    out: dict[Any, Any] = {}
+    out: dict[object, object] = {}
 
-    def put(values: dict[Any, Any]):
+    def put(values: dict[object, object]):
         twice = next((name for name in values if name in out), None)
         if twice is not None:
             raise ModelError(f"initial: '{twice}' is given twice, by its own name and as part of an array")

@@ -6,9 +6,10 @@ arguments of a template together in NumPy; `system.evaluate` does so for traced 
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
+from jax import Array
 from jaxtyping import Float
 
 from ..aliases import Numeric
@@ -54,7 +55,7 @@ class Group:
     def __len__(self):
         return len(self.equation)
 
-    def take(self: G, rows: Any) -> G:
+    def take(self: G, rows: Array) -> G:
         """The instances of these rows."""
         columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return dataclasses.replace(self, **{n: c[rows] for n, c in columns.items() if isinstance(c, np.ndarray)})

@@ -1,7 +1,5 @@
 """A model: components, the connections between them, and learned corrections."""
 
-from typing import Any
-
 from ..errors import ModelError
 from .arrays import ComponentArray, make_array
 from .component import Component
@@ -76,7 +74,7 @@ class AcausalDiagram:
         shape: int | tuple[int, ...],
         /,
         *args: object,
-        **kwargs: Any,
+        **kwargs: object,
     ) -> ComponentArray:
         """Adds an array of equal components, as `Component.add_array` does, and returns it.
 

@@ -96,7 +96,7 @@ def assert_passive(
     ).asserted()
 
 
-def _typical(law: Callable, size: int | None, inputs: Any) -> tuple[np.ndarray, int]:
+def _typical(law: Callable, size: int | None, inputs: object) -> tuple[np.ndarray, int]:
     """(typical sizes of the law's inputs, shape (inputs,), and the number of efforts among them)."""
     own = getattr(law, "size", None) if isinstance(law, AbstractPassive | PortHamiltonian) else None
     if not callable(law):

@@ -274,7 +274,7 @@ class _Walk:
         self.found.append(f"{rule}, but '{a}' is in {first.unit} and '{b}' in {second.unit}{factor}")
 
 
-def _most_common(items: Sequence[Any]) -> Any:
+def _most_common(items: Sequence[object]) -> object:
     return max(items, key=lambda item: (items.count(item), -items.index(item)))
 
 

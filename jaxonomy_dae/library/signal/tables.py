@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.interpolate import RegularGridInterpolator
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 from sympy import floor
 
 from ...errors import ModelError
@@ -83,7 +84,9 @@ class Table1D(Component):
         of a cubic table, which has no kinks.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, x: Any, values: Any, kind: str = "linear", events: bool = False):
+    def __init__(
+        self, ev: EqnEnv, name: str, x: ArrayLike, values: ArrayLike, kind: str = "linear", events: bool = False
+    ):
         super().__init__(ev, name)
         points, found = increasing(x, name, "x"), finite(values, name, "values")
         if found.shape != points.shape:
@@ -115,7 +118,7 @@ class Table2D(Component):
     - `ModelError` if the points are not increasing, not finite, or shapes disagree.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, x: Any, y: Any, values: Any):
+    def __init__(self, ev: EqnEnv, name: str, x: ArrayLike, y: ArrayLike, values: ArrayLike):
         super().__init__(ev, name)
         first, second = increasing(x, name, "x"), increasing(y, name, "y")
         found = finite(values, name, "values")
