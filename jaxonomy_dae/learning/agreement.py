@@ -19,11 +19,13 @@ class Whiteness:
     """The tests of one output of one experiment.
 
     - `correlation`: the correlation of neighbouring residuals.
+    - `lag`, `strongest`: the number of samples over which residuals correlate most strongly, and this correlation.
     - `statistic`: the statistic of Ljung and Box (1978) over `lags` lags. For white noise it has a χ² distribution with
         `lags` degrees of freedom.
     - `peak`: the probability that the spectrum of white noise has a peak as high as this one. A missing mode of the
         model makes such a peak.
     - `spectrum`: the periodogram from the lowest frequency on, of mean one.
+    - `period`: that of its highest peak, in samples.
     """
 
     correlation: float
@@ -31,6 +33,18 @@ class Whiteness:
     lags: int
     peak: float
     spectrum: tuple[float, ...] = ()
+    lag: int = 1
+    strongest: float = np.nan
+    period: float = np.nan
+
+    @property
+    def finding(self) -> str:
+        """What speaks most strongly against white noise."""
+        if self.peak < self.probability:
+            return f"a period of {self.period:.3g} samples stands out"
+        if self.lag == 1:
+            return f"neighbours correlate by {self.strongest:.2f}"
+        return f"residuals {self.lag} samples apart correlate by {self.strongest:.2f}"
 
     @property
     def probability(self) -> float:
@@ -51,7 +65,9 @@ def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
     squares = np.abs(np.fft.rfft(centred)[1 : (n + 1) // 2]) ** 2
     rho = np.array([float(centred[k:] @ centred[:-k]) for k in range(1, lags + 1)]) / power
     statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-    return Whiteness(float(rho[0]), statistic, lags, peak(squares), tuple((squares / squares.mean()).tolist()))
+    spectrum = tuple((squares / squares.mean()).tolist())
+    most, period = int(np.argmax(np.abs(rho))), n / (int(np.argmax(squares)) + 1)
+    return Whiteness(float(rho[0]), statistic, lags, peak(squares), spectrum, most + 1, float(rho[most]), period)
 
 
 def peak(squares: Float[np.ndarray, " m"]) -> float:

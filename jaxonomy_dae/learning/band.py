@@ -88,8 +88,9 @@ def band(
     module, law, points = law_of(estimate, name, grid, law)
     flat = jnp.concatenate([jnp.ravel(leaf).astype(points.dtype) for leaf in weights_of(module)])
     mean, slope = (np.asarray(a, float) for a in _law_and_slope(module, law, flat, points))
-    columns = np.array([g == name for g in objective.coordinates.group]) & objective.coordinates.is_weight
-    spread = np.linalg.norm(slope @ estimate.root[columns], axis=1)
+    c = objective.coordinates
+    columns = np.array([g == name for g in c.group]) & c.is_weight
+    spread = np.linalg.norm((slope * c.size[columns]) @ estimate.root[columns], axis=1)
     ends = explored(estimate, name, along)
     return Band(np.asarray(grid, float), mean, spread, mean - factor * spread, mean + factor * spread, ends)
 

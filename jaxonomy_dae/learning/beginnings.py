@@ -71,10 +71,11 @@ def misfit(objective: Objective, point: Float[np.ndarray, " f"]) -> tuple[float,
 
 
 def beginning(
-    objective: Objective, point: Float[np.ndarray, " f"]
+    objective: Objective, point: Float[np.ndarray, " f"], fresh: Float[np.ndarray, " f"]
 ) -> tuple[Float[np.ndarray, " f"], tuple[float, ...]]:
-    """(where a search for networks begins, and the shares of time over which it goes)."""
-    quiet = silent(objective, point)
+    """(where a search for networks begins, and the shares of time over which it goes). It is the `point`, or `fresh`
+    without the last layers of networks."""
+    quiet = silent(objective, fresh)
     if np.array_equal(quiet, point):
         return point, (1.0,)
     (own, far), (none, far_without) = misfit(objective, point), misfit(objective, quiet)

@@ -27,9 +27,6 @@ OFFSET = 1e-3  # of the confidence region's radius, what may be left to go (Bate
 # Of its standard deviation, by which anything that is reported may move yet where no step gains more: it adds 2 % to
 # errors.
 CLOSE = 0.2
-# The same of predictions: along a valley that bends in many weights, the step of a linearization promises more than
-# there is to gain.
-VALLEY = 1.0
 POLISHED = 12  # steps at the end, as long as three of them leave less than a third
 MIXED = 4  # earlier steps that these are mixed with (Walker & Ni 2011: three to five suffice)
 ROUNDED = 1e-10  # relative rounding of differences of steps
@@ -213,7 +210,7 @@ def descend(
     **Arguments:**
 
     - `reweigh`: `(z, found, weights, factors, free, is_minimum)` to better weights, and how much they change; called
-        once for each factorization, for the next step, and where the search would end.
+        for each factorization, and where the search would end.
 
     **Returns:**
 
@@ -242,16 +239,14 @@ def descend(
         gained = 0.0 if better is None else here.cost - better.cost
         idle = 0 if gained > least else idle + 1
         if better is not None:
-            weights = merit.next_weights(better.weights, here.following)
-            here = _Here.of(merit, better.z, better.found, weights, bounds, reweigh)
+            here = _there(merit, better, bounds, reweigh)
         if better is not None and (idle < PATIENCE or (idle < PERSISTENCE and max(here.open(merit)) > CLOSE)):
             continue
         stuck = better is None or damping > 1  # columns have norm one: beyond, damping alone keeps steps short
         along, tried = _along(merit, here, bounds, least) if stuck else (None, 0)
         count += tried
         if along is not None:
-            weights = merit.next_weights(along.weights, here.following)
-            here, damping, idle = _Here.of(merit, along.z, along.found, weights, bounds, reweigh), FIRST, 0
+            here, damping, idle = _there(merit, along, bounds, reweigh), FIRST, 0
             continue
         finer, tried = _finer(merit, here, least)
         count += tried
@@ -263,8 +258,7 @@ def descend(
         # Weights that stay until the search has found its minimum are now free to change.
         here = _Here.of(merit, here.z, here.found, here.weights, bounds, reweigh, is_minimum=True)
         if here.settled or idle > PERSISTENCE + PATIENCE:
-            single, together = here.open(merit)
-            closed = single <= CLOSE and together <= VALLEY
+            closed = max(here.open(merit)) <= CLOSE
             reason = f"{'converged' if closed else 'stopped'} after {k} steps: no step gains more"
             break
         if better is None:
@@ -278,6 +272,15 @@ def descend(
         here.z, here.found, here.weights, here.cost, history=history, evaluations=count, converged=converged,
         message=reason, noise=merit.noise, left=here.left, tolerance=merit.noise,
     )  # fmt: skip
+
+
+def _there(merit: AbstractMerit, to: Reached, bounds: tuple, reweigh: Reweigh | None) -> _Here:
+    """A point that was reached, with the weights that are better there. With those of the point before, point and
+    weights oscillate around each other: fits of networks took twice as many steps, or did not end."""
+    here = _Here.of(merit, to.z, to.found, to.weights, bounds, reweigh)
+    if reweigh is None:
+        return here
+    return _Here.of(merit, to.z, to.found, merit.next_weights(to.weights, here.following), bounds, reweigh)
 
 
 def _better(

@@ -308,7 +308,8 @@ class Objective:
     @functools.cached_property
     def bends(self) -> Bends | None:
         """The derivatives of networks whose prior is smoothness."""
-        return Bends.of(self.laws, self.coordinates.z_start, np.flatnonzero(self.free)) if self.laws else None
+        c = self.coordinates
+        return Bends.of(self.laws, c.z_start, np.flatnonzero(self.free), c.size) if self.laws else None
 
     def lowest(
         self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None,

@@ -31,6 +31,7 @@ from .objective import Objective
 from .priors import priors_by_name
 from .program import AbstractPredictor, Layout, Runs, Setting
 from .progress import reporter
+from .ranges import in_ranges
 from .runs import residuals, run, why_not
 from .smoother import smoother
 from .starting_points import adam_steps, starting_points
@@ -275,13 +276,15 @@ class Problem:
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
         by_fit = isinstance(self.method, Filter) or not objective.stacked.holdout.any()
         best: tuple[float, Objective, Minimum, Training | None] | None = None
-        for point in starting_points(objective, starts, seed):
+        objective, own, fresh = in_ranges(objective, silent(objective, self._nominal(objective)))
+        points = starting_points(objective, own, fresh, starts, seed)
+        for k, point in enumerate(points):
             training, spans = None, shares
             if first is not None:
                 training = train(objective, point, first)
                 point = training.z
             if plain:
-                point, spans = beginning(objective, point)
+                point, spans = beginning(objective, point, point if k else fresh)
             found = self._descend(objective, point, spans, steps, adam, learning_rate)
             if found is None:
                 continue
@@ -330,6 +333,12 @@ class Problem:
         if not objective.free.any():
             raise ModelError("everything is frozen: there is nothing to fit")
         return objective
+
+    def _nominal(self, objective: Objective) -> Float[np.ndarray, " f"]:
+        """The problem's own values, wherever a search begins, on the scale of an objective's coordinates."""
+        c, own = objective.coordinates, self.coordinates_of(self._setting, objective.stacked)
+        start = np.where(c.fixed, c.start, np.clip(own.start, c.low, c.high))
+        return dataclasses.replace(c, start=start).z_start[objective.free]
 
     def _check_steps(self, adam: int, horizons: Any, first: Any) -> None:
         """Raises a `ModelError` for steps that the method does not take."""

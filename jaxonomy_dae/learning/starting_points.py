@@ -8,12 +8,13 @@ from .objective import Objective
 DECAY = (0.9, 0.999)  # of the means of gradients and of their squares (Kingma & Ba 2015)
 
 
-def starting_points(objective: Objective, count: int, seed: int) -> list[Float[np.ndarray, " f"]]:
-    """The start itself, and others drawn around it by `seed`: parameters within a factor of e or their bounds, starts
-    by their spread, weights of the same sizes."""
-    c, (low, high) = objective.coordinates, objective.bounds
-    first, free = c.z_start[objective.free], objective.free
-    rng, points = np.random.default_rng(seed), [first]
+def starting_points(
+    objective: Objective, own: Float[np.ndarray, " f"], first: Float[np.ndarray, " f"], count: int, seed: int
+) -> list[Float[np.ndarray, " f"]]:
+    """The start itself, `own`, and others drawn around it by `seed`: parameters within a factor of e or their bounds,
+    starts by their spread, weights of the same sizes as those of `first`."""
+    c, free, (low, high) = objective.coordinates, objective.free, objective.bounds
+    rng, points = np.random.default_rng(seed), [own]
     # The bounds of what comes with a method are as far away as can be.
     bounded = np.isfinite(low) & np.isfinite(high) & ~np.isin(np.array(c.names)[free], objective.layout.extra)
     least, most = np.where(bounded, low, 0.0), np.where(bounded, high, 0.0)

@@ -68,7 +68,7 @@ def _colour(fit: "Estimate") -> list[str]:
         if 4 * min(float(together), alone) * len(tests) < IMPROBABLE:
             label, worst = min(each, key=lambda pair: min(pair[1].probability, pair[1].peak))
             where = f" of {label}" if len(s.labels) > 1 else ""
-            found.append(f"'{name}'{where} (neighbours correlate by {worst.correlation:.2f})")
+            found.append(f"'{name}'{where} ({worst.finding})")
     every = [test for each in tests.values() for _, test in each]
     if not found and 2 * slow(every) >= IMPROBABLE:
         return []

@@ -224,3 +224,15 @@ def test_a_frequency_that_stands_out_is_noticed():
     mode = 0.8 * np.sin(0.9 * np.arange(n))
     seen = [whiteness(mode + rng.standard_normal(n)) for _ in range(20)]
     assert sum(w.peak < 1e-3 for w in seen) >= 17 > sum(w.probability < 1e-3 for w in seen)
+
+
+def test_the_finding_names_what_is_not_white():
+    """A period of a day was reported as "neighbours correlate by 0.00"."""
+    rng, n = np.random.default_rng(5), 480
+    noise = rng.standard_normal(n)
+    day = np.cos(2 * np.pi * np.arange(n) / 24) + noise
+    assert whiteness(day).finding == "a period of 24 samples stands out"
+    assert whiteness(np.cumsum(noise)).finding.startswith("neighbours correlate by 0.9")
+    third = noise + 0.6 * np.roll(rng.permutation(noise), 3)
+    third[3:] += 0.8 * noise[:-3]
+    assert whiteness(third).finding.startswith("residuals 3 samples apart correlate by 0.")

@@ -36,7 +36,7 @@ class Plane(eqx.Module):
 def bends_of(module, points, size):
     opaque, count = OpaqueFunction(0, "f", None, points.shape[1], frozenset()), len(module.weights)
     law = Law(module, opaque, np.arange(count), points, size)
-    return Bends.of((law,), np.zeros(count), np.arange(count))
+    return Bends.of((law,), np.zeros(count), np.arange(count), np.ones(count))
 
 
 def test_derivatives_along_directions():

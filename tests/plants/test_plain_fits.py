@@ -58,7 +58,7 @@ def test_a_network_begins_silent_unless_it_says_something():
         problem = learning.Problem(model, record(), train=["c.f"])
         objective = problem._prepared(None, (), None, None)
         z = objective.coordinates.z_start
-        return z, silent(objective, z), *beginning(objective, z)
+        return z, silent(objective, z), *beginning(objective, z, z)
 
     drawn, quiet, chosen, _ = begun(with_network(lambda a: 3 * a if eqx.is_array(a) else a))
     last = np.array([n.startswith("c.f.layers[1]") for n in learning.Problem(system(), record(), train=["c.f"])
@@ -70,7 +70,7 @@ def test_a_network_begins_silent_unless_it_says_something():
     objective = learning.Problem(system(), record(), train=["c.f"])._prepared(None, (), None, None)
     names = objective.coordinates.names
     good[names.index("c.f.layers[0].weight[0]")], good[names.index("c.f.layers[1].weight[0]")] = 0.1, -3.0
-    np.testing.assert_array_equal(beginning(objective, good)[0], good)
+    np.testing.assert_array_equal(beginning(objective, good, good)[0], good)
 
 
 @pytest.mark.long("residuals with and without their Jacobian")
@@ -154,3 +154,33 @@ def test_two_seeds_give_the_same_law_where_the_data_say_the_same():
     np.testing.assert_array_less(np.abs(first.mean - second.mean), 0.2 * first.spread)
     np.testing.assert_array_less(np.abs(first.mean + 0.3 * grid), 3.5 * first.spread)
     assert (first.spread < 0.05).all()
+
+
+class InUnits(Component):
+    """x'' = −x + F·f(u), u = K·x' + O, with a network f: K, O and F are units."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, v = (self.variable(n, start=s, fixed=True) for n, s in (("x", 1.0), ("v", 0.0)))
+        u, (k, o, f) = self.variable("u"), (self.parameter(n, p) for n, p in (("K", 1.0), ("O", 0.0), ("F", 1.0)))
+        net = eqx.nn.MLP(1, 1, 4, 1, jnp.tanh, key=jax.random.key(0))
+        (force,) = self.learned("f", net, inputs=[u])
+        self.add_equations(Eq(u, k * v + o), Eq(der(x), v), Eq(der(v), f * force - x))
+
+
+@pytest.mark.long("residuals with and without their Jacobian, four fits")
+def test_units_of_a_network_s_inputs_and_outputs_do_not_matter():
+    """An input in mm/s saturated every hidden unit, and the search did not end."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(InUnits(ev, "c"))
+    system, grid, laws = AcausalCompiler(ev, diagram)(), np.linspace(-0.5, 0.35, 10), []
+    for k, o, f in ((1.0, 0.0, 1.0), (1e3, 0.0, 1e4), (1e-3, 0.0, 1e-4), (1e5, 1e6, 1.0)):
+        there = system.with_parameters({"c.K": k, "c.O": o, "c.F": f})
+        fit = learning.Problem(there, record(seed=3), train=["c.f"]).fit()
+        band = fit.band("c.f", k * grid + o)
+        assert fit.ok and band.inside.all()
+        np.testing.assert_array_less(np.abs(f * band.mean + 0.3 * grid), 3.5 * f * band.spread)
+        laws.append((f * band.mean, f * band.spread))
+    for mean, spread in laws[1:]:
+        np.testing.assert_array_less(np.abs(mean - laws[0][0]), 0.5 * laws[0][1])
+        np.testing.assert_allclose(spread, laws[0][1], rtol=0.5)
