@@ -31,6 +31,8 @@ POLISHED = 12  # steps at the end, as long as three of them leave less than a th
 MIXED = 4  # earlier steps that these are mixed with (Walker & Ni 2011: three to five suffice)
 ROUNDED = 1e-10  # relative rounding of differences of steps
 EXACT = 1e-7  # of the radius, below which rounding decides: the square root of eps, as the cost is quadratic
+ASIDE = 0.1  # of a step, over which second derivatives are taken (Transtrum & Sethna 2012)
+CURVED = 0.375  # of a step, what its correction may be (the same: 2 |a|/|v| ≤ 0.75)
 SHORTENED = 6  # lengths of an undamped step that are tried, each a quarter of the one before
 FIRST = 1e-3  # damping to begin with, for columns of norm one (Madsen, Nielsen & Tingleff 2004, section 3.2)
 BESIDE = 1e-8  # relative step by which noise is measured: what the cost truly changes by is less than its rounding
@@ -106,6 +108,10 @@ class AbstractMerit(abc.ABC):
     def next_weights(self, here: Weights, better: Weights) -> Weights:
         """The weights for the next step: `here` are those at the current point, `better` those found with the last
         step."""
+
+    def rows(self, z: Float[np.ndarray, " p"], weights: Weights) -> Float[np.ndarray, " r"] | None:
+        """The residuals of `Weights.applied` without their Jacobian; None if that costs as much."""
+        return None
 
     def shortened(self, step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """A step, no longer than the linearization goes."""
@@ -291,6 +297,7 @@ def _better(
     for trial in range(TRIALS):
         step = np.zeros_like(here.z)
         step[here.free] = here.factors.step(damping, rank)
+        step += _bend(merit, here, step, damping, rank)
         new = np.clip(here.z + merit.shortened(step), *bounds)
         if np.array_equal(new, here.z):
             return None, trial, damping
@@ -302,6 +309,22 @@ def _better(
             return reached, trial + 1, damping_after(damping, (here.cost - reached.cost) / max(promised, floor))
         damping *= 6
     return None, TRIALS, damping
+
+
+def _bend(
+    merit: AbstractMerit, here: _Here, step: Float[np.ndarray, " p"], damping: float, rank: int
+) -> Float[np.ndarray, " p"]:
+    """What makes a straight step follow the curve of a valley: its correction of second order, from the residuals'
+    second derivative along it (geodesic acceleration; Transtrum & Sethna 2012, arXiv:1201.5885). Zero where it is too
+    large to be one."""
+    beside = merit.rows(here.z + ASIDE * step, here.weights)
+    if beside is None or not np.isfinite(beside).all():
+        return np.zeros_like(step)
+    second = 2 / ASIDE * ((beside - here.rows.residual) / ASIDE - here.rows.jacobian @ step)
+    bend = np.zeros_like(step)
+    bend[here.free] = 0.5 * here.factors.solved(here.rows.jacobian[:, here.free].T @ second, damping, rank)
+    sizes = [float(np.linalg.norm(here.factors.scale * part[here.free])) for part in (bend, step)]
+    return bend if sizes[0] <= CURVED * sizes[1] else np.zeros_like(step)
 
 
 def _along(

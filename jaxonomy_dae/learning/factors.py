@@ -44,6 +44,11 @@ class Factors:
         gain = self.singular[:rank] / (self.singular[:rank] ** 2 + damping)
         return -(self.right[:, :rank] @ (gain * self.projected[:rank])) / self.scale
 
+    def solved(self, gradient: Float[np.ndarray, " p"], damping: float, rank: int) -> Float[np.ndarray, " p"]:
+        """The step for another residual, of which the gradient is given."""
+        right = self.right[:, :rank]
+        return -(right @ ((right.T @ (gradient / self.scale)) / (self.singular[:rank] ** 2 + damping))) / self.scale
+
     def directions(self, noise: float) -> Float[np.ndarray, "p r"]:
         """The directions whose singular values are beyond the noise, shape (p, rank)."""
         return self.right[:, : self.rank(noise)] / self.scale[:, None]

@@ -38,6 +38,11 @@ class SumOfSquares(AbstractMerit):
             tried = self.residual(z)
         return np.inf if tried is None else weights.cost(z, tried)
 
+    def rows(self, z: Float[np.ndarray, " p"], weights: Weights) -> Float[np.ndarray, " r"] | None:
+        """By the residuals alone, if they can be had alone."""
+        tried = None if self.residual is None else self.residual(z)
+        return None if tried is None else np.concatenate([weights.bent(tried)[0], weights.prior(z).residual])
+
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
         """The residuals alone tell whether a point costs less, if they can be had alone."""
         if self.residual is not None:
