@@ -4,8 +4,8 @@ that, and whether it calls itself reliable.
     python benchmarks/learning/plain_fits.py [drag,stribeck,valve,diode,gap,two] [8x1:tanh] [noise seeds] [weight seeds]
         [seconds] [factor of the noise]
 
-Truths are integrated by SciPy, in SI units: inputs may be pascals. Errors are root mean squares over
-the range that the run explored, relative to the size of the law; "stated" is the same of the standard deviation of the band.
+Truths are integrated by SciPy, in SI units: inputs may be pascals. Errors are root mean squares over the range that the
+run explored, relative to the law's size; "stated" is the same of the standard deviation of the band.
 """
 
 import sys

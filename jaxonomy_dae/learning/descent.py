@@ -79,7 +79,7 @@ class AbstractMerit(abc.ABC):
     - `noise`: the relative error of the Jacobian, the tolerance of the integration: directions within it are not
         followed.
     - `finer`: the same with a tolerance that is less by a factor; None where the precision does not allow it.
-    - `hidden`: the coordinates that are not reported by themselves, such as weights of networks.
+    - `hidden`: the coordinates that are not reported by themselves, weights of networks. Damping treats them as equals.
     """
 
     evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None]
@@ -146,7 +146,7 @@ def offset(factors: Factors, noise: float) -> float:
 @dataclasses.dataclass(frozen=True)
 class _Here:
     """A point with all that follows from one factorization there: better weights, how much these change, and what is
-    left to go."""
+    left to go. `paces` are the factors for steps that are damped."""
 
     z: Float[np.ndarray, " p"]
     found: Evaluation
@@ -155,6 +155,7 @@ class _Here:
     cost: float
     free: Bool[np.ndarray, " p"]
     factors: Factors
+    paces: Factors
     following: Weights
     change: float
     left: float
@@ -170,9 +171,11 @@ class _Here:
         left = offset(factors, merit.noise)
         is_minimum = is_minimum or left <= OFFSET
         following, change = (weights, 0.0) if reweigh is None else reweigh(z, found, weights, factors, free, is_minimum)
+        paces = factors.alike(np.broadcast_to(merit.hidden, z.shape)[free])
         return cls(
-            z, found, weights, rows, cost, free=free, factors=factors, following=following, change=change, left=left
-        )
+            z, found, weights, rows, cost, free=free, factors=factors, paces=paces, following=following,
+            change=change, left=left,
+        )  # fmt: skip
 
     def open(self, merit: AbstractMerit) -> tuple[float, float]:
         """By how much of their standard deviations a full step moves (the coordinates that are reported, at most; the
@@ -293,10 +296,10 @@ def _better(
     merit: AbstractMerit, here: _Here, bounds: tuple[np.ndarray, np.ndarray], damping: float
 ) -> tuple[Reached | None, int, float]:
     """A point that costs less, how many were tried, and the next damping."""
-    rank, rows = here.factors.rank(merit.noise), here.rows
+    rank, rows = here.paces.rank(merit.noise), here.rows
     for trial in range(TRIALS):
         step = np.zeros_like(here.z)
-        step[here.free] = here.factors.step(damping, rank)
+        step[here.free] = here.paces.step(damping, rank)
         step += _bend(merit, here, step, damping, rank)
         new = np.clip(here.z + merit.shortened(step), *bounds)
         if np.array_equal(new, here.z):
@@ -322,8 +325,8 @@ def _bend(
         return np.zeros_like(step)
     second = 2 / ASIDE * ((beside - here.rows.residual) / ASIDE - here.rows.jacobian @ step)
     bend = np.zeros_like(step)
-    bend[here.free] = 0.5 * here.factors.solved(here.rows.jacobian[:, here.free].T @ second, damping, rank)
-    sizes = [float(np.linalg.norm(here.factors.scale * part[here.free])) for part in (bend, step)]
+    bend[here.free] = 0.5 * here.paces.solved(here.rows.jacobian[:, here.free].T @ second, damping, rank)
+    sizes = [float(np.linalg.norm(here.paces.scale * part[here.free])) for part in (bend, step)]
     return bend if sizes[0] <= CURVED * sizes[1] else np.zeros_like(step)
 
 

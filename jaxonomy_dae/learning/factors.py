@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..programs.threads import one_thread
 
@@ -33,6 +33,17 @@ class Factors:
             triangle = np.asarray(scipy.linalg.qr(columns, mode="r", check_finite=False)[0])[: columns.shape[1]]
             left, singular, right = scipy.linalg.svd(triangle[:, :-1], full_matrices=False, check_finite=False)
         return cls(singular, right.T, scale, left.T @ triangle[:, -1])
+
+    def alike(self, columns: Bool[np.ndarray, " p"]) -> "Factors":
+        """Factors with one scale for some columns, the largest of theirs: damping then treats their coordinates as
+        equals in the units that they have. Scaled one by one, weights that have no effect yet go furthest: those of
+        inner layers, while the last one is zero. Then 12 of 20 searches for laws of one input ended, and all so."""
+        if not columns.any():
+            return self
+        scale = np.where(columns, self.scale[columns].max(), self.scale)
+        rows = self.singular[:, None] * self.right.T * (self.scale / scale)
+        left, singular, right = scipy.linalg.svd(rows, full_matrices=False, check_finite=False)
+        return Factors(singular, right.T, scale, left.T @ self.projected)
 
     def rank(self, noise: float) -> int:
         """The number of singular values beyond the `noise` of the columns, relative to their norms: perturbed by as
