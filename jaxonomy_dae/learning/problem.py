@@ -254,8 +254,10 @@ class Problem:
             called with a `learning.Progress`.
 
         Without `start`, `first`, `adam` and `horizons`, networks begin at their own weights or with a last layer of
-        zero, whichever is closer to the data. If both are far from the data, horizons grow. If no step reduces the
-        cost, the search measures the error of the integration, and tightens the tolerances if that error is the cause.
+        zero, whichever is closer to the data. The weights of a raw `equinox.nn.MLP` are measured by the ranges of its
+        inputs and the size of its outputs, so units do not matter. If both starts are far from the data, horizons grow.
+        If no step reduces the cost, the search measures the error of the integration, and tightens the tolerances if
+        that error is the cause.
 
         **Raises:**
 
