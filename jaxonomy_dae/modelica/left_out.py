@@ -4,6 +4,7 @@ import math
 import sys
 from collections.abc import Callable
 
+import numpy as np
 import scipy.special
 import sympy
 
@@ -63,6 +64,13 @@ def _low_pass(real: list, constant: list, linear: list, frequency: Value) -> lis
     return [[c * w for c in real], [c * w**2 for c in constant], [c * w for c in linear]]
 
 
+def _least_squares(a: list, b: list, *_: Value, **__: Value) -> list:
+    """The x of least |a x - b|, and of least |x| where there are several."""
+    if not all(isinstance(v, int | float) for v in [*flattened(a), *flattened(b)]):
+        raise ModelError("least squares need numbers")
+    return np.linalg.lstsq(np.array(a, float), np.array(b, float), rcond=None)[0].tolist()
+
+
 def _normal_cumulative(x: Value, mean: Value = 0.0, deviation: Value = 1.0) -> Value:
     erf = of_numbers(math.erf, sympy.erf)
     return (1 + erf((x - mean) / (deviation * math.sqrt(2)))) / 2
@@ -117,5 +125,6 @@ LEFT_OUT: dict[str, Callable[..., Value]] = {
     "Modelica.Math.Random.Generators.Xorshift64star.initialState": initial_state,
     "Modelica.Math.Distributions.Normal.cumulative": _normal_cumulative,
     "Modelica.Math.Special.erfInv": of_numbers(scipy.special.erfinv, sympy.erfinv),
+    "Modelica.Math.Matrices.leastSquares": _least_squares,
     "getInterpolationCoefficients": time_table_coefficients,
 }

@@ -173,6 +173,10 @@ def test_functions_that_texts_leave_out():
     """Against NumPy: norms, a rotation and its angle, the phases of windings, a filter's cut-off."""
     frames = "Modelica.Mechanics.MultiBody.Frames"
     v = [3.0, -4.0, 12.0]
+    fitted = LEFT_OUT["Modelica.Math.Matrices.leastSquares"]([[0.0, 1.0], [1.0, 1.0], [2.0, 1.0]], [1.0, 3.0, 4.0])
+    assert fitted == pytest.approx([1.5, 7 / 6], rel=1e-14)
+    with pytest.raises(ModelError, match="least squares need numbers"):
+        LEFT_OUT["Modelica.Math.Matrices.leastSquares"]([[sympy.Symbol("x")]], [1.0])
     assert LEFT_OUT["Modelica.Math.Vectors.length"](v) == 13.0
     assert LEFT_OUT["Modelica.Math.Vectors.normalize"](v) == pytest.approx([x / 13 for x in v])
     axis = [x / 13 for x in v]
