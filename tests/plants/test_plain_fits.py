@@ -184,3 +184,13 @@ def test_units_of_a_network_s_inputs_and_outputs_do_not_matter():
     for mean, spread in laws[1:]:
         np.testing.assert_array_less(np.abs(mean - laws[0][0]), 0.5 * laws[0][1])
         np.testing.assert_allclose(spread, laws[0][1], rtol=0.5)
+
+
+@pytest.mark.slow
+def test_a_filter_looks_for_a_smoother_law_too():
+    """A fit of a network by a filter ended in an error where it looked for a smoother law."""
+    problem = learning.Problem(system(), record(), train=["c.f"], method=learning.Filter(noise={"c.v": 1e-3}))
+    fit = problem.fit(warn=False)
+    assert fit.minimum.converged
+    band = fit.band("c.f", np.linspace(-0.5, 0.4, 10))
+    np.testing.assert_array_less(np.abs(band.mean + 0.3 * band.grid), 4 * band.spread)
