@@ -114,7 +114,8 @@ test-floors: $(FLOORS)/.stamp
 	$(FLOORS)/bin/python -m pytest $(IN_PARALLEL) $(ON_FLOORS)
 
 bench: $(VENV)/.stamp-dev
-	@set -e; for f in benchmarks/[!_]*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
+	@set -e; for f in $(filter-out %/record.py,$(wildcard benchmarks/[!_]*.py)); do echo "== $$f"; $(BIN)/python "$$f"; done
+	$(BIN)/python -m benchmarks.record
 
 notebook: $(VENV)/.stamp-dev
 	$(BIN)/python docs/execute_notebooks.py $(NOTEBOOKS)
