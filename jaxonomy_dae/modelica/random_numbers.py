@@ -26,7 +26,7 @@ ROUNDS = 10  # that hide a poor seed
 NO_SEED = 126247697  # in place of two seeds that are zero, of which xorshift makes zeros for ever
 
 
-def _xorshift64star(words: list[Word], place: Any, cut: Callable[[Word], Word]) -> tuple[Word, list[Word], Any]:
+def _xorshift64star(words: list[Word], place: Word, cut: Callable[[Word], Word]) -> tuple[Word, list[Word], Word]:
     (x,) = words
     x = x ^ x >> 12
     x = x ^ cut(x << 25)
@@ -34,14 +34,14 @@ def _xorshift64star(words: list[Word], place: Any, cut: Callable[[Word], Word]) 
     return x, [x], place
 
 
-def _xorshift128plus(words: list[Word], place: Any, cut: Callable[[Word], Word]) -> tuple[Word, list[Word], Any]:
+def _xorshift128plus(words: list[Word], place: Word, cut: Callable[[Word], Word]) -> tuple[Word, list[Word], Word]:
     a, b = words
     a = a ^ cut(a << 23)
     new = cut((a ^ b ^ a >> 17 ^ b >> 26) + b)
     return new, [b, new], place
 
 
-def _xorshift1024star(words: list[Word], place: Any, cut: Callable[[Word], Word]) -> tuple[Word, list[Word], Any]:
+def _xorshift1024star(words: list[Word], place: Word, cut: Callable[[Word], Word]) -> tuple[Word, list[Word], Word]:
     after = (place + 1) % len(words)
     a, b = _at(words, place % len(words)), _at(words, after)
     b = b ^ cut(b << 31)
@@ -53,11 +53,11 @@ def _like(word: Word, number: int) -> Word:
     return number if isinstance(word, int) else np.uint64(number)
 
 
-def _at(words: list[Word], place: Any) -> Word:
+def _at(words: list[Word], place: Word) -> Word:
     return words[int(place)] if isinstance(place, int) else jnp.stack(words)[place]
 
 
-def _with(words: list[Word], place: Any, new: Word) -> list[Word]:
+def _with(words: list[Word], place: Word, new: Word) -> list[Word]:
     return [new if k == place else w for k, w in enumerate(words)] if isinstance(place, int) else [
         jnp.where(place == k, new, w) for k, w in enumerate(words)
     ]  # fmt: skip

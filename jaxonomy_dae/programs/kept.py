@@ -17,7 +17,7 @@ import tempfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 
@@ -28,6 +28,7 @@ ROOM = 2**30  # bytes in the folder, beyond which the least recently used files 
 AFTER = 0.8  # of the room, what is left then: so that not every new file makes a search
 CALLBACK = b"python_cpu_callback"  # in programs that call Python, which no other process can run
 _CHOSEN: list[Path | None] = []
+Options: TypeAlias = dict[str, bool | int]  # of the compiler
 
 
 def keep_programs(folder: str | os.PathLike[str] | None) -> None:
@@ -97,12 +98,12 @@ def machine_and_versions() -> dict[str, str]:
     }
 
 
-def _path(key: str, options: dict[str, Any]) -> Path | None:
+def _path(key: str, options: Options) -> Path | None:
     where = folder()
     return None if where is None else where / hashlib.sha256(f"{key} {sorted(options.items())}".encode()).hexdigest()
 
 
-def save(key: str | None, options: dict[str, Any], run: Any, cost: float) -> None:
+def save(key: str | None, options: Options, run: Any, cost: float) -> None:
     """Keeps an executable, and the processor seconds that it cost, if there is a folder for it. Nothing that goes wrong
     here matters."""
     path = None if key is None else _path(key, options)
@@ -112,7 +113,7 @@ def save(key: str | None, options: dict[str, Any], run: Any, cost: float) -> Non
             _write(path, struct.pack("<d", cost) + zlib.compress(content, 1))
 
 
-def load(key: str | None, options: dict[str, Any], outputs: int, arrays: Sequence[Any]) -> tuple[Any, float] | None:
+def load(key: str | None, options: Options, outputs: int, arrays: Sequence[Any]) -> tuple[Any, float] | None:
     """The executable that an earlier process has kept, and what it cost; None if there is none, or it is not whole.
     It takes a list of such arrays, and returns a list of so many."""
     path = None if key is None else _path(key, options)

@@ -34,7 +34,7 @@ from .staging import is_traced
 # XLA's older code generator for CPUs makes one kernel of what the newer one makes several, and LLVM leaves out its
 # expensive passes. Compilation, run (processor seconds; jax 0.10.2): a rod on a pin 7.5 → 3.0 s, 0.6 → 0.9 ms; one
 # thermal state 1.2 → 0.4 s, 0.1 ms both ways; its gradient 3.2 → 1.4 s, 0.1 ms both ways.
-QUICK: dict[str, Any] = {
+QUICK: kept.Options = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
@@ -48,7 +48,7 @@ def _chosen_by_the_user() -> bool:
     return any(f"--{name}" in os.environ.get("XLA_FLAGS", "") for name in QUICK)
 
 
-def quick() -> dict[str, Any]:
+def quick() -> kept.Options:
     """Compiler options of the quick tier; none on other processors."""
     return QUICK if platform() == "cpu" and not _chosen_by_the_user() and not _REFUSED else {}
 
@@ -108,7 +108,7 @@ class Program:
         if known is not None:
             kept.save_record(known, record(self._text, called(text), self._outcome))
 
-    def _take(self, run: Callable[..., Any], options: dict[str, Any], doubted: bool = False) -> None:
+    def _take(self, run: Callable[..., Any], options: kept.Options, doubted: bool = False) -> None:
         """Runs this executable from now on. One that was read may not run (`doubted`)."""
         self._run, self._options, self._doubted = run, options, doubted
         if not options and not doubted:
@@ -126,7 +126,7 @@ class Program:
         self._times = traced[0], lowered[0]
         return text
 
-    def _recalled(self, known: str | None, tiers: list[dict[str, Any]]) -> bool:
+    def _recalled(self, known: str | None, tiers: list[kept.Options]) -> bool:
         """Reads what an earlier process knew of this program, and its executable. True if both are there."""
         content = kept.load_record(known)
         found = None if content is None else recalled(content)
@@ -149,7 +149,7 @@ class Program:
         self._lowered, self.stands_alone = None, True
         return None
 
-    def _read(self, tiers: list[dict[str, Any]]) -> bool:
+    def _read(self, tiers: list[kept.Options]) -> bool:
         """Reads the best executable that an earlier process has kept. True if there is one."""
         for options in tiers:
             run = self._loaded(options)
@@ -158,7 +158,7 @@ class Program:
                 return True
         return False
 
-    def _loaded(self, options: dict[str, Any]) -> Callable[..., PyTree] | None:
+    def _loaded(self, options: kept.Options) -> Callable[..., PyTree] | None:
         """The executable that an earlier process has kept; None if there is none."""
         with timed() as spent:
             found = kept.load(kept.key(self._text), options, sum(self._outcome[2]), self._arrays)
@@ -168,7 +168,7 @@ class Program:
         run, self._cost = found
         return run
 
-    def _compiled(self, options: dict[str, Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
+    def _compiled(self, options: kept.Options) -> tuple[Callable[..., Any], kept.Options]:
         """The executable, and the options with which it was made."""
         with timed() as spent:
             try:
