@@ -15,7 +15,7 @@ Row = dict[int, Any]  # of numbers of one field: Any, as no type says that two a
 
 
 def null_vectors(
-    rows: Sequence[Row], one: object = Fraction(1), is_weak: Callable[[object], bool] = lambda value: False
+    rows: Sequence[Row], one: Any = Fraction(1), is_weak: Callable[[Any], bool] = lambda value: False
 ) -> list[Row]:
     """Vectors w ≠ 0 with Σ wᵢ·rowᵢ = 0, by number of the row: those that the elimination finds, as many as there are
     redundant rows, fewest entries first.
@@ -31,7 +31,7 @@ def null_vectors(
     return sorted(found, key=lambda w: (len(w), sorted(w)))
 
 
-def _eliminated(rows: list[Row], is_weak: Callable[[object], bool]) -> tuple[list[int], list[tuple[int, int, object]]]:
+def _eliminated(rows: list[Row], is_weak: Callable[[Any], bool]) -> tuple[list[int], list[tuple[int, int, Any]]]:
     """The rows that become empty; and the operations row −= factor·pivot, as (row, pivot, factor), in order."""
     members: dict[int, set[int]] = {}
     for i, row in enumerate(rows):
@@ -68,7 +68,7 @@ def _eliminated(rows: list[Row], is_weak: Callable[[object], bool]) -> tuple[lis
     return sorted(empty), operations
 
 
-def _combination(row: int, operations: Sequence[tuple[int, int, object]], one: object) -> Row:
+def _combination(row: int, operations: Sequence[tuple[int, int, Any]], one: Any) -> Row:
     """The weights of the original rows in a reduced row: undoes `operations`, the last one first."""
     weights: Row = {row: one}
     for k, i, factor in reversed(operations):

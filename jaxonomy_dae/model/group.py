@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 
 from ..aliases import Numeric
@@ -55,7 +54,7 @@ class Group:
     def __len__(self):
         return len(self.equation)
 
-    def take(self: G, rows: Array) -> G:
+    def take(self: G, rows: np.ndarray | Sequence[int] | slice) -> G:
         """The instances of these rows."""
         columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return dataclasses.replace(self, **{n: c[rows] for n, c in columns.items() if isinstance(c, np.ndarray)})
