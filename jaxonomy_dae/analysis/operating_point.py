@@ -69,11 +69,11 @@ class OperatingPoint(eqx.Module):
         return read[0] if single else jnp.stack(read) if read else jnp.zeros((0,), self.x.dtype)
 
     @property
-    def start(self) -> dict[str, Any]:
+    def start(self) -> dict[str, Array]:
         """The states by name: `simulate(point.system, t1, initial=point.start)` continues from here."""
         return {name: self.x[..., k] for k, name in enumerate(self.system.states)}
 
-    def to_dict(self) -> dict[str, np.ndarray]:
+    def to_dict(self) -> dict[str, Array]:
         """All variables by name."""
         names = self.system.variables
         return dict(zip(names, jnp.moveaxis(self[names], -1, 0), strict=True))
