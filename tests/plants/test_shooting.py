@@ -64,7 +64,8 @@ def test_a_constrained_model(pendulum):
     np.testing.assert_allclose(np.hypot(x, y), shot.values["pend.L"], rtol=1e-9)
     row = shot.table()["pend.L"]
     np.testing.assert_allclose(shot.profile("pend.L")["pend.L"], [row.low, row.high], atol=0.1 * (row.high - row.low))
-    assert problem.fit().table()["pend.m"].note == "not determined"
+    # The law can take up any mass: the search stays, or follows the valley to where it ends. It says so either way.
+    assert problem.fit().table()["pend.m"].note in ("not determined", "ran away")
     assert shot.holdout_score == pytest.approx(single.holdout_score, rel=1e-4)
 
 
