@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 
 FILE = Path(__file__).with_name("figures.jsonl")
+sys.path.append(str(FILE.parent))  # the scripts beside this one find each other there
 MEMBERS = 1_000
 
 
