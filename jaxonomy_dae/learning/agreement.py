@@ -67,7 +67,10 @@ def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
     statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
     spectrum = tuple((squares / squares.mean()).tolist())
     most, period = int(np.argmax(np.abs(rho))), n / (int(np.argmax(squares)) + 1)
-    return Whiteness(float(rho[0]), statistic, lags, peak(squares), spectrum, most + 1, float(rho[most]), period)
+    return Whiteness(
+        correlation=float(rho[0]), statistic=statistic, lags=lags, peak=peak(squares), spectrum=spectrum, lag=most + 1,
+        strongest=float(rho[most]), period=period,
+    )  # fmt: skip
 
 
 def peak(squares: Float[np.ndarray, " m"]) -> float:
