@@ -26,6 +26,9 @@ class Factors:
         """Factorizes a Jacobian whose columns are known to `noise`, relative to the largest: smaller ones are not blown
         up to its size."""
         scale = np.linalg.norm(jacobian, axis=0)
+        # What rounding alone leaves of a column that is zero (of a mass that cancels, say) points anywhere.
+        seen = scale > max(jacobian.shape, default=0) * np.finfo(float).eps * scale.max(initial=0.0)
+        jacobian, scale = np.where(seen, jacobian, 0.0), np.where(seen, scale, 0.0)
         scale = np.maximum(scale, noise * scale.max(initial=0.0))
         scale[scale == 0] = 1.0
         columns = np.column_stack([jacobian / scale, residual])

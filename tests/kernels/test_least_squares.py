@@ -272,3 +272,13 @@ def test_the_finding_names_what_is_not_white():
     third = noise + 0.6 * np.roll(rng.permutation(noise), 3)
     third[3:] += 0.8 * noise[:-3]
     assert whiteness(third).finding.startswith("residuals 3 samples apart correlate by 0.")
+
+
+@pytest.mark.parametrize("weak, moves", [(1e-17, 0.0), (1e-12, -2e12)])
+def test_a_column_of_rounding_moves_nothing(weak, moves):
+    """Of a parameter that cancels, rounding leaves a column of any direction, and a step along it was as long as it was
+    wrong. A column that is weak but known gives the step of the normal equations: −2/weak for a residual of 2."""
+    residual = np.array([1.0, 2.0, 0.0])
+    jacobian = np.array([[1.0, 0.0], [0.0, weak], [0.0, 0.0]])
+    factors = Factors.of(residual, jacobian, 1e-14)
+    np.testing.assert_allclose(factors.step(0.0, factors.rank(1e-14)), [-1.0, moves], rtol=1e-10)
