@@ -93,7 +93,7 @@ class _Writer:
         if name in self.classes:
             return name
         source = found.source
-        empty = Class(source.kind, name, (), (), (), (), (), (), {}, source.literals, None, source.external, "")
+        empty = Class(source.kind, name, literals=source.literals, external=source.external)
         self.classes[name] = empty
         if source.literals:
             return name
@@ -134,7 +134,7 @@ class _Writer:
     def _lineage(self, found: Found) -> list[Found]:
         """What a class continues or extends, the first base first, and the class itself."""
         out: list[Found] = []
-        if found.source.extends_inherited:
+        if found.source.continues:
             inherited = self.library.inherited_class(found)
             out += self._lineage(inherited) if inherited else []
         for base, _ in found.source.bases:

@@ -74,10 +74,10 @@ def flat_of(outermost: Class) -> FlatModel:
     """
     if outermost.kind in ("model", "class", "block"):
         return FlatModel(outermost, {})
-    models = [c for c in outermost.classes if c.kind == "model"]
+    models = [c for c in outermost.classes.values() if c.kind == "model"]
     if len(models) != 1:
         raise ModelError(f"a flat text holds one model; '{outermost.name}' holds {len(models)}")
-    classes = {c.name: c for c in outermost.classes if c is not models[0]}
+    classes = {name: c for name, c in outermost.classes.items() if c is not models[0]}
     return FlatModel(_with_numbers(models[0], literal_numbers(classes)), classes)
 
 

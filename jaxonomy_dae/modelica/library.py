@@ -7,8 +7,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from .read_source import Source, read_source
-from .tree import Declaration
+from ..errors import ModelError
+from .read_base import read_base
+from .tree import Class, Declaration
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -20,7 +21,7 @@ class Found:
     - `changes`: the modifiers of the short definition through which it was reached.
     """
 
-    source: Source
+    source: Class
     path: str
     scopes: tuple["Found", ...]
     changes: tuple[tuple[dict[str, Any], tuple["Found", ...]], ...] = ()
@@ -40,6 +41,20 @@ class Constant:
 
 
 Member: TypeAlias = Found | Constant
+
+
+def read_source(file: Path) -> Class:
+    """The class of a file.
+
+    **Raises:**
+
+    - `ModelError` for what is not Modelica, with file, line and column.
+    """
+    try:
+        found = read_base(file.read_text(encoding="utf-8-sig"))
+    except ModelError as error:
+        raise ModelError(f"{file}: {str(error).removeprefix('Base Modelica, ')}") from None
+    return found._replace(folder=file.parent) if file.name == "package.mo" else found
 
 
 class Library:

@@ -1,9 +1,11 @@
-"""Reads Base Modelica, the flat text that Modelica compilers write (Modelica Change Proposal MCP-0031).
+"""Reads Modelica: flat texts in Base Modelica (Modelica Change Proposal MCP-0031), and the sources of libraries.
 
 A recursive descent over a list of tokens, one method for each rule of the grammar; operators by precedence climbing.
+Annotations are passed over, but for that of a model, which says how to run it.
 """
 
 import re
+from collections.abc import Iterator
 from typing import Any, NoReturn
 
 from ..errors import ModelError
@@ -52,10 +54,14 @@ INSIDE = "[\\'"  # a quoted name with names in its subscripts
 _QUOTED = r"'(?:[^'\\]|\\.)*'"
 _PART = re.compile(rf"([^\[\]]+)(?:\[((?:{_QUOTED}|\[(?:{_QUOTED}|[^\[\]'])*\]|[^\[\]'])*)\])?\.?")
 PREFIXES = frozenset(
-    "parameter constant discrete input output final flow stream inner outer each protected public".split()
+    "parameter constant discrete input output final flow stream inner outer each protected public redeclare "
+    "replaceable".split()
 )
 CLASSES = ("model", "record", "function", "type", "package", "class", "block", "connector")
-_BEFORE_CLASS = ("pure", "impure", "operator", "partial", "encapsulated", "final", "expandable")
+BEFORE_CLASS = frozenset(
+    "redeclare replaceable final partial encapsulated inner outer pure impure operator expandable".split()
+)
+BEFORE_MODIFIER = frozenset({"final", "each", "redeclare", "replaceable"})
 SECTION_ENDS = ("end", "equation", "algorithm", "initial", "external", "protected", "public", "annotation")
 
 
@@ -129,6 +135,13 @@ class Reader:
             return key
         return ""
 
+    def past(self, words: frozenset[str]) -> frozenset[str]:
+        """Goes past all of these words that follow, and returns them."""
+        first = self.i
+        while self.keys[self.i] in words:
+            self.i += 1
+        return frozenset(self.keys[first : self.i])
+
     def need(self, word: str) -> None:
         if self.keys[self.i] != word:
             self._fail(f"expected '{word}'")
@@ -143,6 +156,14 @@ class Reader:
         self.i += 1
         return word
 
+    def path(self) -> str:
+        """Names joined by dots; a dot before them stands for the outermost package."""
+        self.take(".")
+        out = self.name()
+        while self.take("."):
+            out += "." + self.name()
+        return out
+
     def line(self) -> int:
         return self.lines.of(self.places[self.i])
 
@@ -154,6 +175,24 @@ class Reader:
             if not self.take("+"):
                 break
         return out
+
+    def pass_parentheses(self) -> None:
+        """Goes past what stands in parentheses, if anything does."""
+        depth = 0
+        while depth or self.at("("):
+            if self.kinds[self.i] == "stop":
+                self._fail("expected ')'")
+            depth += {"(": 1, ")": -1}.get(self.keys[self.i], 0)
+            self.i += 1
+
+    def pass_annotation(self) -> None:
+        if self.take("annotation"):
+            self.pass_parentheses()
+
+    def pass_constraint(self) -> None:
+        if self.take("constrainedby"):
+            self.path()
+            self.pass_parentheses()
 
     # --- expressions -------------------------------------------------------------------------------------------------
 
@@ -196,6 +235,7 @@ class Reader:
             left = Binary(sign, left, self.primary() if strength == _POWER else self.operation(strength + 1))
 
     def primary(self) -> Expression:
+        self.take(".")  # of a name from the outermost package, such as `.Modelica.Constants.pi`
         kind, word = self.kinds[self.i], self.words[self.i]
         if kind == "number":
             self.i += 1
@@ -311,8 +351,8 @@ class Reader:
     def statements(self, *ends: str) -> tuple[Statement, ...]:
         out: list[Statement] = []
         while not self.at(*ends):
-            if self.take("annotation"):
-                self.modifiers()
+            if self.at("annotation"):
+                self.pass_annotation()
                 self.need(";")
             else:
                 out.append(self.statement())
@@ -339,8 +379,7 @@ class Reader:
             self.need("end")
             self.need(kind)
         self.comment()
-        if self.take("annotation"):
-            self.modifiers()
+        self.pass_annotation()
         self.need(";")
         return out
 
@@ -368,43 +407,55 @@ class Reader:
     # --- declarations and classes ------------------------------------------------------------------------------------
 
     def modifiers(self) -> dict[str, Any]:
+        """What stands in parentheses behind a name, if anything does; a redeclared class is noted as the declaration of
+        what it stands for."""
         out: dict[str, Any] = {}
-        self.need("(")
-        while not self.take(")"):
-            while self.take("final", "each"):
-                pass
-            name = self.name()
-            while self.take("."):
-                name += "." + self.name()
-            inner = self.modifiers() if self.at("(") else None
-            value = self.expression() if self.take("=", ":=") else None
-            out[name] = value if inner is None else inner if value is None else {**inner, "=": value}
+        ended = not self.take("(")
+        while not (ended or self.take(")")):
+            self.past(BEFORE_MODIFIER)
+            if self.keys[self.i] in CLASSES and self.kinds[self.i + 1] == "word":
+                self.i += 1
+                name = self.name()
+                self.need("=")
+                out[name] = self._short(name)
+                self.pass_constraint()
+            else:
+                name = self.path()
+                if self.kinds[self.i] in ("word", "quoted"):  # a redeclared component with its type
+                    name = self.name()
+                inner = self.modifiers() if self.at("(") else None
+                value = self._value()
+                out[name] = value if inner is None else inner if value is None else {**inner, "=": value}
             self.comment()
+            self.pass_annotation()
             if not self.at(")"):
                 self.need(",")
         return out
 
-    def declaration(self) -> Declaration:
-        line = self.line()
-        prefixes = set()
-        while self.kinds[self.i] == "word" and self.words[self.i] in PREFIXES:
-            prefixes.add(self.words[self.i])
-            self.i += 1
-        kind = self.name()
-        while self.take("."):
-            kind += "." + self.name()
-        dimensions = self._subscripts()
-        name = self.name()
-        dimensions += self._subscripts()
-        modifiers = self.modifiers() if self.at("(") else {}
-        value = self.expression() if self.take("=", ":=") else None
-        comment = self.comment()
-        if self.take("annotation"):
-            self.modifiers()
+    def _value(self) -> Expression | None:
+        return self.expression() if self.take("=", ":=") else None
+
+    def declarations(self) -> Iterator[Declaration]:
+        """The declarations of one clause, such as `Real a, b = 1;`."""
+        line, prefixes = self.line(), self.past(PREFIXES)
+        kind, shared, first = self.path(), self._subscripts(), True
+        while first or self.take(","):
+            first = False
+            name = self.name()
+            dimensions = self._subscripts() + shared
+            modifiers, value = self.modifiers(), self._value()
+            if self.take("if"):
+                self.expression()
+            self.pass_constraint()
+            comment = self.comment()
+            self.pass_annotation()
+            yield Declaration(prefixes, kind, name, dimensions, modifiers, value, comment, line)
         self.need(";")
-        return Declaration(frozenset(prefixes), kind, name, dimensions, modifiers, value, comment, line)
 
     def file(self) -> Class:
+        if self.take("within"):
+            while not self.take(";"):
+                self.i += 1
         out = self.definition()
         self.take(";")
         if self.kinds[self.i] != "stop":
@@ -412,51 +463,56 @@ class Reader:
         return out
 
     def definition(self) -> Class:
-        while self.take(*_BEFORE_CLASS):
-            pass
-        kind = self.take(*CLASSES)
+        before = self.past(BEFORE_CLASS)
+        kind = self.take(*CLASSES) or ("package" if "operator" in before else "")  # `operator 'constructor'`
         if not kind:
             self._fail("expected a class, such as package, model or function")
+        continues = bool(self.take("extends"))
         name = self.name()
         if self.take("="):
-            return self._short(kind, name)
-        return self._long(kind, name)
+            return self._stands_for(kind, name)
+        self.pass_parentheses()  # of `redeclare function extends f(…)`
+        return self._long(kind, name, continues)
 
-    def _short(self, kind: str, name: str) -> Class:
+    def _stands_for(self, kind: str, name: str) -> Class:
         literals: list[str] = []
-        base = None
+        alias = None
         if self.take("enumeration"):
             self.need("(")
             while not self.take(")"):
-                literals.append(self.name())
+                if not self.take(":"):
+                    literals.append(self.name())
                 self.comment()
+                self.pass_annotation()
                 self.take(",")
-            comment = self.comment()
-            self.need(";")
         else:
-            line = self.line()
-            prefixes = frozenset(iter(lambda: self.take(*PREFIXES), ""))
-            of = self.name()
-            while self.take("."):
-                of += "." + self.name()
-            dimensions = self._subscripts()
-            modifiers = self.modifiers() if self.at("(") else {}
-            comment = self.comment()
-            if self.take("annotation"):
-                self.modifiers()
-            self.need(";")
-            base = Declaration(prefixes, of, name, dimensions, modifiers, None, comment, line)
-        return Class(kind, name, (), (), (), (), (), (), {}, tuple(literals), base, None, comment)
+            alias = self._short(name)
+        comment = self.comment()
+        self.pass_constraint()
+        self.comment()
+        self.pass_annotation()
+        self.need(";")
+        return Class(kind, name, literals=tuple(literals), alias=alias, comment=comment)
 
-    def _long(self, kind: str, name: str) -> Class:
+    def _short(self, name: str) -> Declaration:
+        """What a short definition stands for."""
+        line, prefixes, of = self.line(), self.past(PREFIXES), self.path()
+        dimensions = self._subscripts()
+        if of == "der":
+            self.pass_parentheses()
+        return Declaration(prefixes, of, name, dimensions, self.modifiers(), None, "", line)
+
+    def _long(self, kind: str, name: str, continues: bool) -> Class:
         comment = self.comment()
         declarations: list[Declaration] = []
-        classes: list[Class] = []
+        classes: dict[str, Class] = {}
+        bases: list[tuple[str, dict[str, Any]]] = []
+        imports: list[tuple[str, str]] = []
         sections: dict[str, list] = {
             "equation": [], "initial equation": [], "algorithm": [], "initial algorithm": []
         }  # fmt: skip
         annotation: dict[str, Any] = {}
-        external, base = None, None
+        external = None
         while not self.take("end"):
             if self.take("protected", "public"):
                 continue
@@ -465,33 +521,65 @@ class Reader:
                 self.i += 1
             if section := self.take("equation", "algorithm"):
                 sections[start + section].append(self.statements(*SECTION_ENDS))
-            elif self.take("annotation"):
-                annotation = self.modifiers()
+            elif self.at("annotation"):
+                if kind == "model":
+                    self.i += 1
+                    annotation = self.modifiers()
+                self.pass_annotation()
                 self.need(";")
             elif self.take("external"):
                 external = self._external()
+            elif self.take("import"):
+                imports += self._imports()
             elif self.take("extends"):
-                line, of = self.line(), self.name()
-                base = Declaration(frozenset(), of, name, (), {}, None, "", line)
+                bases.append((self.path(), self.modifiers()))
+                self.pass_annotation()
                 self.need(";")
             elif self._begins_class():
-                classes.append(self.definition())
+                inner = self.definition()
+                classes[inner.name] = inner
             else:
-                declarations.append(self.declaration())
+                declarations += self.declarations()
         self.name()
         self.need(";")
-        joined = {k: tuple(s for section in sections[k] for s in section) for k in ("equation", "initial equation")}
+        equations, initial = (
+            tuple(s for section in sections[k] for s in section) for k in ("equation", "initial equation")
+        )
         return Class(
-            kind, name, tuple(declarations), joined["equation"], joined["initial equation"],
-            tuple(sections["algorithm"]), tuple(sections["initial algorithm"]), tuple(classes), annotation, (), base,
-            external, comment,
+            kind, name, tuple(declarations), equations, initial, tuple(sections["algorithm"]),
+            tuple(sections["initial algorithm"]), classes, tuple(bases), tuple(imports), annotation, external=external,
+            comment=comment, continues=continues,
         )  # fmt: skip
 
     def _begins_class(self) -> bool:
         i = self.i
-        while self.keys[i] in _BEFORE_CLASS:
+        while self.keys[i] in BEFORE_CLASS:
             i += 1
-        return self.keys[i] in CLASSES and self.kinds[i + 1] in ("word", "quoted")
+        if self.keys[i] in CLASSES:
+            return self.kinds[i + 1] in ("word", "quoted")
+        return self.kinds[i] == "quoted" and i > self.i and self.keys[i - 1] == "operator"
+
+    def _imports(self) -> list[tuple[str, str]]:
+        """The pairs (local name, full name) of one clause."""
+        name = self.name()
+        if self.take("="):
+            out = [(name, self.path())]
+        else:
+            out = self._imports_by_name(name)
+        self.comment()
+        self.need(";")
+        return out
+
+    def _imports_by_name(self, name: str) -> list[tuple[str, str]]:
+        while self.take("."):
+            if self.take("{"):
+                names = []
+                while not self.take("}"):
+                    names.append(self.name())
+                    self.take(",")
+                return [(each, f"{name}.{each}") for each in names]
+            name += "." + self.name()
+        return [("*" if self.take(".*") else name.rpartition(".")[2], name)]
 
     def _external(self) -> str:
         """The name of the called function; its arguments are left out."""
@@ -501,8 +589,8 @@ class Reader:
         while not self.take(";"):
             if self.keys[self.i + 1] == "(" and self.kinds[self.i] == "word" and not called:
                 called = self.words[self.i]
-            if self.take("annotation"):
-                self.modifiers()
+            if self.at("annotation"):
+                self.pass_annotation()
             else:
                 self.i += 1
         return called

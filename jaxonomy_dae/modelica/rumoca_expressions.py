@@ -359,8 +359,8 @@ def flat_class(
     initial: Iterable[Statement] = (), algorithm: Sequence[Statement] = (), external: str | None = None,
 ) -> Class:  # fmt: skip
     return Class(
-        kind, name, tuple(declarations), tuple(equations), tuple(initial), (tuple(algorithm),) if algorithm else (), (),
-        (), {}, (), None, external, "",
+        kind, name, tuple(declarations), tuple(equations), tuple(initial), (tuple(algorithm),) if algorithm else (),
+        external=external,
     )  # fmt: skip
 
 

@@ -90,7 +90,7 @@ class Scope:
             return name
         if c.literals:
             return "Integer"
-        return self.kind(c.base.type) if c.base is not None else name
+        return self.kind(c.made_of) if c.made_of is not None else name
 
     def value(self, name: str) -> Value:
         known = self._known_of(name)
@@ -279,8 +279,8 @@ class Scope:
     def _least(self, type_name: str) -> int:
         """What a discrete variable starts at if nothing says so: an enumeration at its first literal, others at 0."""
         c = self.flat.classes.get(type_name)
-        if c is not None and c.base is not None:
-            return self._least(c.base.type)
+        if c is not None and c.made_of is not None:
+            return self._least(c.made_of)
         return 1 if c is not None and c.literals else 0
 
     def stored(self, name: str) -> Value:

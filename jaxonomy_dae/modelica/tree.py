@@ -4,6 +4,7 @@ Named tuples, since a model of a megabyte has a few hundred thousand nodes and t
 dataclasses.
 """
 
+from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 
@@ -192,19 +193,36 @@ class Declaration(NamedTuple):
 
 
 class Class(NamedTuple):
-    """A model, function, record, package or type. `literals` are those of an enumeration, `base` is what a short
-    definition stands for. `external` is the called C function, if there is one."""
+    """A model, function, record, package or type.
+
+    - `classes`: those inside, by name. Those of a package that are in files of their own are added when they are looked
+        up, from its `folder`.
+    - `bases`: what it extends: names, with modifiers and the redeclared classes among them.
+    - `imports`: pairs (local name, full name); `*` is the local name of all that a package holds.
+    - `literals`: of an enumeration. `alias`: what a short definition stands for.
+    - `external`: the called C function, if there is one.
+    - `continues`: true for `redeclare function extends f`: it continues the inherited class of its name.
+    """
 
     kind: str
     name: str
-    declarations: tuple[Declaration, ...]
-    equations: tuple[Statement, ...]
-    initial_equations: tuple[Statement, ...]
-    algorithms: tuple[tuple[Statement, ...], ...]
-    initial_algorithms: tuple[tuple[Statement, ...], ...]
-    classes: tuple["Class", ...]
-    annotation: dict[str, Any]
-    literals: tuple[str, ...]
-    base: Declaration | None
-    external: str | None
-    comment: str
+    declarations: tuple[Declaration, ...] = ()
+    equations: tuple[Statement, ...] = ()
+    initial_equations: tuple[Statement, ...] = ()
+    algorithms: tuple[tuple[Statement, ...], ...] = ()
+    initial_algorithms: tuple[tuple[Statement, ...], ...] = ()
+    classes: dict[str, "Class"] = {}
+    bases: tuple[tuple[str, dict[str, Any]], ...] = ()
+    imports: tuple[tuple[str, str], ...] = ()
+    annotation: dict[str, Any] = {}
+    literals: tuple[str, ...] = ()
+    alias: Declaration | None = None
+    external: str | None = None
+    comment: str = ""
+    continues: bool = False
+    folder: Path | None = None
+
+    @property
+    def made_of(self) -> str | None:
+        """The name of the type that a type stands for or extends."""
+        return self.alias.type if self.alias else self.bases[0][0] if self.bases else None
