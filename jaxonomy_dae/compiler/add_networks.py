@@ -12,11 +12,11 @@ from ..model.provenance import Provenance, Provenances, Written
 from ..model.tables import EquationGroup, RowInjection, VariableTable
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.symbols import TimeSymbol, VariableSymbol
-from .group_builder import GroupBuilder
+from .group_builder import joined_by_template, linear_equation
 from .number_model import ModelNumbers
 
 
-def add_learned_terms(model: ModelNumbers, builder: GroupBuilder, networks: dict[str, Callable]):
+def add_learned_terms(model: ModelNumbers, builder: list[EquationGroup], networks: dict[str, Callable]):
     """Adds an equation for each output of the networks and functions in components."""
     for i in model.instances:
         for term in i.component.learned_terms:
@@ -32,7 +32,7 @@ def add_learned_terms(model: ModelNumbers, builder: GroupBuilder, networks: dict
 
 
 def _add_opaque(
-    builder: GroupBuilder,
+    builder: list[EquationGroup],
     opaque: OpaqueFunction,
     output: int,
     y: tuple[np.ndarray, int],
@@ -40,16 +40,9 @@ def _add_opaque(
     provenance: Provenances,
 ):
     """Adds an equation for each of n places where a function stands: variables have shape (n,)."""
-    pairs = [y, *inputs]
-    n = len(provenance)
-    builder.add(
-        OpaqueTemplate(opaque, output),
-        np.stack([v for v, _ in pairs], axis=1),
-        np.tile([o for _, o in pairs], (n, 1)),
-        np.zeros((n, 0)),
-        np.zeros((n, 0)),
-        provenance,
-    )
+    variables, orders = zip(y, *inputs, strict=True)
+    order = np.tile(orders, (len(provenance), 1))
+    builder.append(EquationGroup.of(OpaqueTemplate(opaque, output), np.stack(variables, axis=1), order, provenance))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +72,8 @@ def add_corrections(
     found = [c for c in found if c.inject != "row"]
     if not found:
         return variables, groups, rows
-    names, builder = list(variables.names), GroupBuilder()
+    names = list(variables.names)
+    builder: list[EquationGroup] = []
     corrections: dict[int, list[int]] = {}
     for c in found:
         for j, v in enumerate(c.targets):
@@ -94,14 +88,14 @@ def add_corrections(
         physics[v] = u = len(names)
         names.append(f"{names[v]}:physics")
         terms = [(v, 1, 1.0), (u, 0, -1.0), *((w, 0, -1.0) for w in ws)]
-        builder.add_linear(terms, Provenance(f"corrected derivative of {names[v]}"))
+        builder.append(linear_equation(terms, Provenance(f"corrected derivative of {names[v]}")))
     redirected = []
     for group in groups:
         new = physics[group.variable]
         hit = (new >= 0) & (group.order > 0)
         variable, order = np.where(hit, new, group.variable), np.where(hit, group.order - 1, group.order)
         redirected.append(dataclasses.replace(group, variable=variable, order=order))
-    return _extended(variables, names, first), (*redirected, *builder.groups()), rows
+    return _extended(variables, names, first), (*redirected, *joined_by_template(builder)), rows
 
 
 def _corrections(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..errors import StructuralError
-from ..model.group import Group, Point
+from ..model.group import Point
 from ..model.tables import ZERO, EquationGroup, ParameterTable, equation_offsets, locate
 from ..structure.incidence import Incidence
 from ..structure.pantelides import Offsets, diagonal_blocks
@@ -54,7 +54,7 @@ def _zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values)
         if not len(slots) or not all(template.coefficient_is_constant(int(k)) for k in slots):
             continue
         reads = np.zeros(group.variable.shape, np.int64)  # whatever the slots are: these entries are constant
-        own = Group(template, equation, reads, group.factor, group.parameter, group.coefficient)
+        own = group.reading(reads)
         at = Point.of(np.ones(1), values, 0.0)
         coefficient = np.where(used, own.partials(at), 0.0)[:, slots].sum(axis=1)
         bound = np.where(used, own.partial_errors(at, np.zeros(2)), 0.0)[:, slots].sum(axis=1)

@@ -96,9 +96,7 @@ def _starts(model: ModelNumbers, started: Sequence[tuple[Variable, Instances, in
     for template, paths, members in groups.values():
         ids = np.concatenate([i.variable + k for i, k in members])
         columns = [np.concatenate(c) for c in zip(*_parameters(model, members, paths), strict=True)]
-        found.append(
-            Formulas(template, ids, np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64))
-        )
+        found.append(Formulas.of(template, ids, np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0))))
     return Starts(model.n_variables, found)
 
 
@@ -195,5 +193,5 @@ def _dependent_parameters(
             targets.append(p)
             parameters.append(ids)
         for template, targets, parameters in rows.values():
-            groups.append(Formulas(template, np.array(targets), np.array(parameters, np.int64)))
+            groups.append(Formulas.of(template, targets, parameters))
     return tuple(groups)

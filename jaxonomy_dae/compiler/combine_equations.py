@@ -274,26 +274,13 @@ def group_of(graph: Node, provenance: Provenance) -> EquationGroup:
     """A group of one equation."""
     quantities = sorted(label[1:] for label in graph.leaves if label[0] == "quantity")
     coefficients = _coefficients(graph)
+    variable, order, written = [v for v, _ in quantities], [o for _, o in quantities], Provenances.of([provenance])
     if coefficients is not None:
-        return EquationGroup(
-            LinearTemplate(len(quantities)),
-            np.array([[v for v, _ in quantities]], np.int64),
-            np.array([[o for _, o in quantities]], np.int64),
-            np.ones((1, len(quantities))),
-            np.zeros((1, 0), np.int64),
-            np.array([[coefficients[quantity_label(*q)] for q in quantities]]),
-            Provenances.of([provenance]),
-        )
+        numbers = [coefficients[quantity_label(*q)] for q in quantities]
+        return EquationGroup.of(LinearTemplate(len(quantities)), variable, order, written, coefficient=numbers)
     parameters = sorted(label[1] for label in graph.leaves if label[0] == "of model")
     replaced = {quantity_label(*q): leaf(slot_label((k, 0))) for k, q in enumerate(quantities)}
     replaced |= {("of model", p): leaf(parameter_label(k)) for k, p in enumerate(parameters)}
     slots = tuple((k, 0) for k in range(len(quantities)))
-    return EquationGroup(
-        template_of(substitute(graph, replaced), slots, len(parameters)),
-        np.array([[v for v, _ in quantities]], np.int64),
-        np.array([[o for _, o in quantities]], np.int64),
-        np.ones((1, len(quantities))),
-        np.array([parameters], np.int64).reshape(1, -1),
-        np.zeros((1, 0)),
-        Provenances.of([provenance]),
-    )
+    template = template_of(substitute(graph, replaced), slots, len(parameters))
+    return EquationGroup.of(template, variable, order, written, parameter=parameters)

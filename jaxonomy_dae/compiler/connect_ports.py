@@ -10,12 +10,11 @@ from scipy.sparse.csgraph import connected_components
 from ..errors import ModelError
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance, Provenances
-from ..model.tables import PortTable
+from ..model.tables import EquationGroup, PortTable
 from ..modeling.arrays import PortArray
 from ..modeling.connections import Connection
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.ports import Domain, Port
-from .group_builder import GroupBuilder
 from .number_model import Instances, ModelNumbers
 
 NAMED = 4  # ports of a junction, in messages
@@ -55,7 +54,7 @@ class Junctions:
         return Provenance(f"{kind} {where}: {domain.through[k - len(domain.across)][0]} sums to zero")
 
 
-def connect_ports(model: ModelNumbers, diagram: AcausalDiagram, builder: GroupBuilder) -> PortTable:
+def connect_ports(model: ModelNumbers, diagram: AcausalDiagram, builder: list[EquationGroup]) -> PortTable:
     """Across variables of joined ports are equal, their through variables sum to zero; loose ports carry none.
 
     A port has two faces: the outer one joins in the connections of the component's parent, the inner one in those of
@@ -173,7 +172,9 @@ def _faces(model: ModelNumbers, ports: _Ports, end: Port | PortArray, owner: Ins
     return 2 * at + int(own)
 
 
-def _add_equations(ports: _Ports, face: np.ndarray, junction: np.ndarray, start: np.ndarray, builder: GroupBuilder):
+def _add_equations(
+    ports: _Ports, face: np.ndarray, junction: np.ndarray, start: np.ndarray, builder: list[EquationGroup]
+):
     """The equations of all junctions, in the junctions' order."""
     size = np.diff(start)
     port, sign = face // 2, 1.0 - 2.0 * (face % 2)
@@ -206,6 +207,6 @@ def _add_equations(ports: _Ports, face: np.ndarray, junction: np.ndarray, start:
             by = np.lexsort((place, set_))
             ordered.append((set_[by[0]], place[by[0]], length, item[by], variable[by], coefficient[by]))
     for _, _, length, item, variable, coefficient in sorted(ordered, key=lambda entry: entry[:3]):
-        none = np.zeros((len(item), 0))
         provenance = Provenances.made(source, item, False)
-        builder.add(LinearTemplate(length), variable, np.zeros(variable.shape), none, coefficient, provenance)
+        order = np.zeros(variable.shape)
+        builder.append(EquationGroup.of(LinearTemplate(length), variable, order, provenance, coefficient=coefficient))

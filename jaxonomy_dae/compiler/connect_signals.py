@@ -6,14 +6,15 @@ import numpy as np
 
 from ..errors import ModelError
 from ..model.provenance import Provenance
+from ..model.tables import EquationGroup
 from ..modeling.component import Component
 from ..modeling.connections import Signal
 from ..modeling.diagram import AcausalDiagram
-from .group_builder import GroupBuilder
+from .group_builder import linear_equation
 from .number_model import Instances, ModelNumbers
 
 
-def connect_signals(model: ModelNumbers, diagram: AcausalDiagram, builder: GroupBuilder) -> set[int]:
+def connect_signals(model: ModelNumbers, diagram: AcausalDiagram, builder: list[EquationGroup]) -> set[int]:
     """Inputs equal what drives them; returns the inputs that are driven, which are unknowns from then on."""
     owners: list[tuple[Instances | None, Sequence[Signal]]] = [(None, diagram.signals)]
     owners.extend((i, i.component.signals) for i in model.instances if i.component.signals)
@@ -54,10 +55,8 @@ def connect_signals(model: ModelNumbers, diagram: AcausalDiagram, builder: Group
                             "cannot drive it too"
                         )
                     driven[v] = names[source]
-                    builder.add_linear(
-                        [(v, 0, 1.0), (source, 0, -1.0)],
-                        Provenance(f"connection of {names[source]}, {names[v]}: equal signals"),
-                    )
+                    says = Provenance(f"connection of {names[source]}, {names[v]}: equal signals")
+                    builder.append(linear_equation([(v, 0, 1.0), (source, 0, -1.0)], says))
     return set(driven)
 
 

@@ -41,17 +41,15 @@ def differentiate_equations(groups: tuple[EquationGroup, ...], offsets: Offsets,
         while len(rows):
             slot_base = np.array([b for b, _ in template.slots], np.int64)
             slot_q = np.array([q for _, q in template.slots], np.int64)
-            v = group.variable[np.ix_(rows, slot_base)] if len(slot_base) else np.zeros((len(rows), 0), np.int64)
-            o = group.order[np.ix_(rows, slot_base)] + slot_q if len(slot_base) else v
-            s = group.factor[np.ix_(rows, slot_base)] if len(slot_base) else v
-            zero = v == ZERO
-            quantity = np.where(zero, ZERO, first[column[v]] + o)
+            places = np.ix_(rows, slot_base)
+            variable, order = group.variable[places], group.order[places] + slot_q
+            zero = variable == ZERO
             out.append(
                 ExtendedGroup(
                     template=template,
                     equation=first_extended[first_equation + rows] + k,
-                    quantity=quantity,
-                    factor=np.where(zero, 0, s),
+                    quantity=np.where(zero, ZERO, first[column[variable]] + order),
+                    factor=np.where(zero, 0, group.factor[places]),
                     parameter=group.parameter[rows],
                     coefficient=group.coefficient[rows],
                     base=first_equation + rows,

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
+from ..model.group import Columns
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenances
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, VariableTable
@@ -26,7 +27,7 @@ SWEEPS = 8  # after which equations of any length are looked at one by one
 
 
 @dataclasses.dataclass(frozen=True)
-class _Terms:
+class _Terms(Columns):
     """Linear equations, term by term in the order of the equations: coefficient·(variable)^(order)."""
 
     row: np.ndarray
@@ -34,9 +35,6 @@ class _Terms:
     order: np.ndarray
     coefficient: np.ndarray
     noise: np.ndarray  # what rounding may have added to or taken from the coefficient
-
-    def take(self, index: np.ndarray) -> "_Terms":
-        return _Terms(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))
 
 
 @dataclasses.dataclass
@@ -307,15 +305,7 @@ def _linear_groups(terms: _Terms, rows: np.ndarray, provenance: Provenances) -> 
     for length in dict.fromkeys(count[rows].tolist()):
         members = rows[count[rows] == length]
         at = start[members][:, None] + np.arange(length)
-        groups.append(
-            EquationGroup(
-                LinearTemplate(length),
-                terms.variable[at],
-                terms.order[at],
-                np.ones(at.shape),
-                np.zeros((len(members), 0), np.int64),
-                terms.coefficient[at],
-                provenance.take(members),
-            )
-        )
+        says, template = provenance.take(members), LinearTemplate(length)
+        group = EquationGroup.of(template, terms.variable[at], terms.order[at], says, coefficient=terms.coefficient[at])
+        groups.append(group)
     return groups

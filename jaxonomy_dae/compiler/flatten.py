@@ -7,14 +7,14 @@ symbolic work does not grow with the number of instances.
 
 from collections.abc import Callable
 
-from ..model.tables import Declared, FlatModel
+from ..model.tables import Declared, EquationGroup, FlatModel
 from ..modeling.diagram import AcausalDiagram
 from .add_networks import add_corrections, add_learned_terms
 from .collect_declarations import parameter_table, variable_table
 from .collect_events import event_table, held_table
 from .connect_ports import connect_ports
 from .connect_signals import connect_signals
-from .group_builder import GroupBuilder
+from .group_builder import joined_by_template
 from .number_model import ModelNumbers, array_names
 from .read_equations import add_components, read_accounts
 
@@ -28,7 +28,7 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
         inputs of neural blocks that do not exist.
     """
     model = ModelNumbers(diagram)
-    builder = GroupBuilder()
+    builder: list[EquationGroup] = []
     networks: dict[str, Callable] = {}
     add_components(model, builder)
     add_learned_terms(model, builder, networks)
@@ -36,7 +36,7 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     driven = connect_signals(model, diagram, builder)
     variables = variable_table(model, driven)
     parameters, values = parameter_table(model)
-    groups = builder.groups()
+    groups = joined_by_template(builder)
     variables, groups, rows = add_corrections(model, diagram, variables, groups, networks)
     events, held, accounts = event_table(model), held_table(model), read_accounts(model)
     name = diagram.name or ""

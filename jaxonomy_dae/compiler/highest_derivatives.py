@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..model.extended import ExtendedGroup
-from ..model.group import Group, Point
+from ..model.group import Point, QuantityGroup
 from ..model.natural_sizes import natural_sizes
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 from ..structure.pantelides import Offsets
@@ -74,14 +73,7 @@ class HighestDerivatives:
                 found = values, KNOWN * np.abs(values)
             else:
                 at = Point.of(point.ravel(), self.values, 0.37 + 0.1 * trial)
-                own = Group(
-                    group.template,
-                    np.arange(len(group)),
-                    np.arange(point.size).reshape(point.shape),
-                    group.factor,
-                    group.parameter,
-                    group.coefficient,
-                )
+                own = group.reading(np.arange(point.size).reshape(point.shape))
                 found = own.partials(at), own.partial_errors(at, KNOWN * np.abs(at.values))
             self._partials[g, trial] = found
         return self._partials[g, trial]
@@ -137,7 +129,7 @@ class HighestDerivatives:
             found |= {quantity_label(v, k): s for k in range(q, q + HIGHER)}
         return found
 
-    def _at_natural_sizes(self, equations: np.ndarray) -> tuple[list[ExtendedGroup], np.ndarray, np.ndarray]:
+    def _at_natural_sizes(self, equations: np.ndarray) -> tuple[list[QuantityGroup], np.ndarray, np.ndarray]:
         """Regroups `equations`, in the order of `_chosen`. Returns (groups, quantities as (variable, order) of shape
         (q, 2), sizes of shape (q,)); the sizes balance the terms of each equation."""
         number: dict[tuple[int, int], int] = {}
@@ -147,20 +139,8 @@ class HighestDerivatives:
             pairs = zip(group.variable.ravel().tolist(), group.order.ravel().tolist(), strict=True)
             found = [ZERO if v == ZERO else number.setdefault((v, q), len(number)) for v, q in pairs]
             quantity = np.array(found, np.int64).reshape(group.variable.shape)
-            own = count + np.arange(len(group))
+            groups.append(group.reading(quantity, count + np.arange(len(group))))
             count += len(group)
-            groups.append(
-                ExtendedGroup(
-                    template=group.template,
-                    equation=own,
-                    quantity=quantity,
-                    factor=group.factor,
-                    parameter=group.parameter,
-                    coefficient=group.coefficient,
-                    base=own,
-                    level=0,
-                )
-            )
         size, _ = natural_sizes(groups, count, np.zeros(len(number)), self.values, by_terms=True)
         return groups, np.array(list(number), np.int64).reshape(-1, 2), np.abs(size)
 

@@ -5,6 +5,7 @@ each instance, where many templates would be equal but for them: coordinates and
 what parameters cost.
 """
 
+import dataclasses
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
@@ -12,27 +13,15 @@ import numpy as np
 
 from ..expressions.node import Node, Number, constant, leaf, linear, multiply, number, postorder
 from ..expressions.substitute import rebuilt, substitute
-from ..model.provenance import Provenances
 from ..model.symbolic import SymbolicTemplate, number_label, template_of
-from ..model.template import AbstractTemplate
+from ..model.tables import EquationGroup
 
 MANY = 8  # templates of one shape, from which on their numbers are taken out
 KEPT = (-1, 0, 1)  # numbers that belong to a shape
 _ANY = leaf(("number", "any"))
 
 
-class TemplateRows(NamedTuple):
-    """Equations of one template: arrays of shape (n, slots), (n, slots), (n, parameters), (n, coefficients)."""
-
-    template: AbstractTemplate
-    variable: np.ndarray
-    order: np.ndarray
-    parameter: np.ndarray
-    coefficient: np.ndarray
-    provenance: Provenances
-
-
-def lifted(rows: Sequence[TemplateRows]) -> list[TemplateRows]:
+def lifted(rows: Sequence[EquationGroup]) -> list[EquationGroup]:
     """The rows in the same order, with numbers taken out of templates that differ in numbers only, if there are more
     than `MANY` of them."""
     out = list(rows)
@@ -54,8 +43,8 @@ def lifted(rows: Sequence[TemplateRows]) -> list[TemplateRows]:
         template = template_of(substitute(graph, filled), slots, n_parameters, len(differ))
         for numbers, members in variants.values():
             for k in members:
-                coefficients = np.tile([float(numbers[j]) for j in differ], (len(rows[k].provenance), 1))
-                out[k] = rows[k]._replace(template=template, coefficient=coefficients)
+                coefficients = np.tile([float(numbers[j]) for j in differ], (len(rows[k]), 1))
+                out[k] = dataclasses.replace(rows[k], template=template, coefficient=coefficients)
     return out
 
 

@@ -10,16 +10,14 @@ from ..expressions.to_sympy import shortened
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Lines, Provenances, Written
 from ..model.symbolic import canonical, linear_coefficients
-from ..model.tables import AccountGroup
-from ..model.template import AbstractTemplate
+from ..model.tables import AccountGroup, EquationGroup
 from ..modeling.component import line_of
 from ..modeling.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
-from .group_builder import GroupBuilder
-from .lift_numbers import TemplateRows, lifted
+from .lift_numbers import lifted
 from .number_model import Instances, Members, ModelNumbers
 
 
-def add_components(model: ModelNumbers, builder: GroupBuilder):
+def add_components(model: ModelNumbers, builder: list[EquationGroup]):
     read_once: dict[int, Node] = {}  # of an expression, by its id: equal components hold the same objects
     by_shape: dict[tuple, list[Instances]] = {}
     for i in model.instances:
@@ -30,7 +28,7 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
                     read_once[id(residual)] = read_expression(residual, model.path(i))
             graphs = tuple(read_once[id(r)] for r in c.equations)
             by_shape.setdefault((graphs, tuple(c.variables), tuple(c.parameters)), []).append(i)
-    rows: list[TemplateRows] = []
+    rows: list[EquationGroup] = []
     for (graphs, _, _), parts in by_shape.items():
         members = Members(model, parts)
         number = members.number
@@ -46,15 +44,12 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
             lines = Lines([i.number for i in parts], [line_of(i.component, i.component.equations[k]) for i in parts])
             provenance = Provenances.made(Written(f"0 = {shortened(shown)}", model.paths, lines), number, True)
             if coefficients is None:
-                template: AbstractTemplate = canonical(graph, variables, parameters)
-                numbers = np.zeros((len(number), 0))
+                template = canonical(graph, variables, parameters)
+                rows.append(EquationGroup.of(template, ids, order, provenance, parameter=parameter_ids))
             else:
-                template = LinearTemplate(len(variables))
-                numbers = np.tile(coefficients, (len(number), 1))
-                parameter_ids = np.zeros((len(number), 0))
-            rows.append(TemplateRows(template, ids, order, parameter_ids, numbers, provenance))
-    for row in lifted(rows):
-        builder.add(*row)
+                numbers, template = np.tile(coefficients, (len(number), 1)), LinearTemplate(len(variables))
+                rows.append(EquationGroup.of(template, ids, order, provenance, coefficient=numbers))
+    builder += lifted(rows)
 
 
 def slots_of(
@@ -117,14 +112,16 @@ def read_accounts(model: ModelNumbers) -> tuple[AccountGroup, ...]:
         graph = read_once[expression]
         variables, parameters = slots_of(model, parts[0], expression, graph)
         members = Members(model, parts)
+        number = members.number
         groups.append(
-            AccountGroup(
-                kind,
+            AccountGroup.of(
                 canonical(graph, variables, parameters),
                 members.ids([v.path for v in variables], "variable"),
-                np.tile(np.array([v.order for v in variables], np.int64), (len(members.number), 1)),
-                members.ids([p.path for p in parameters], "parameter"),
-                members.number,
+                np.tile([v.order for v in variables], (len(number), 1)),
+                Provenances.made(Written(f"the {kind} {shortened(expression)}", model.paths), number, True),
+                parameter=members.ids([p.path for p in parameters], "parameter"),
+                kind=kind,
+                component=number,
             )
         )
     return tuple(groups)

@@ -23,7 +23,7 @@ def lost_cancellation(
     for group in groups:
         if not group.parameter.shape[1] or group.template.opaque is not None:
             continue
-        given = list(parameters[group.parameter].T), list(group.coefficient.T), t, Networks(())
+        given = *group.numbers(parameters), t, Networks(())
         lost = np.ones(len(group), bool)
         for value in POINTS:
             residual = group.template.residual(list((group.factor * value).T), *given, backend="numpy")

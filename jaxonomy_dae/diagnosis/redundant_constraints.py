@@ -34,7 +34,7 @@ from ..model.constraint_jacobian import (
     evaluate_errors,
     independent_parts,
 )
-from ..model.group import Group, Point
+from ..model.group import Point
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance
 from ..model.quantities import ReducedModel
@@ -284,15 +284,7 @@ def _demands(at: ModelAt, wanted: dict[tuple[str, str], list[np.ndarray]]) -> di
     for group in at.model.flat.groups:
         for i, source in enumerate(group.provenance):
             for w in wanted.get((source.component, source.statement), ())[:1]:
-                row = slice(i, i + 1)
-                slopes = Group(
-                    group.template,
-                    np.arange(1),
-                    group.variable[row],
-                    group.factor[row],
-                    group.parameter[row],
-                    group.coefficient[row],
-                ).partials(there)
+                slopes = group.reading(group.variable).take([i]).partials(there)
                 for v, slope in zip(group.variable[i].tolist(), slopes[0].tolist(), strict=True):
                     if v != ZERO:
                         out[v] = out.get(v, 0.0) + slope * w

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from ..judgement.rank import Rank, rank_of
 from ..judgement.sparse_rank import SparseRank, sparse_rank_of
 from ..lowering.schedule import AnyStep, SparseStep
-from ..model.group import Group, Point
+from ..model.group import Point, QuantityGroup
 from ..tolerances import KNOWN, RANK
 
 DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
@@ -44,10 +44,10 @@ class Effects(NamedTuple):
 class Block:
     """Equations, some instances of templates, and as many unknown quantities that they determine."""
 
-    equations: tuple[Group, ...]
+    equations: tuple[QuantityGroup, ...]
     unknown: np.ndarray
 
-    def matrix(self, of_slots: Callable[[Group], np.ndarray]) -> Any:
+    def matrix(self, of_slots: Callable[[QuantityGroup], np.ndarray]) -> Any:
         """A sparse matrix from numbers by slots, (n, slots) of each group of equations."""
         rows, columns, entries = [], [], []
         for first, group in self._with_rows():
@@ -77,14 +77,14 @@ class Block:
         """The residuals."""
         return np.concatenate([group.residual(known.at) for group in self.equations])
 
-    def _with_rows(self) -> Iterator[tuple[int, Group]]:
+    def _with_rows(self) -> Iterator[tuple[int, QuantityGroup]]:
         """The groups of equations, each with the number of its first row."""
         first = 0
         for group in self.equations:
             yield first, group
             first += len(group)
 
-    def _columns(self, group: Group) -> np.ndarray:
+    def _columns(self, group: QuantityGroup) -> np.ndarray:
         """The column of each slot, −1 for quantities from outside."""
         order = np.argsort(self.unknown)
         place = order[np.minimum(np.searchsorted(self.unknown, group.quantity, sorter=order), len(order) - 1)]
@@ -125,7 +125,7 @@ class Block:
         return Effects(matters.any(axis=(1, 2)) | ~np.isfinite(size), size > 0)
 
 
-def _partials(own: Group, arguments: list[np.ndarray], at: Point) -> np.ndarray:
+def _partials(own: QuantityGroup, arguments: list[np.ndarray], at: Point) -> np.ndarray:
     quantities, parameters = (a.ravel() for a in arguments)
     return own.partials(Point.of(quantities, parameters, at.t, at.networks))
 

@@ -15,7 +15,7 @@ from ..judgement.sparse_rank import SparseRank
 from ..lowering.plan import SystemPlan
 from ..lowering.remembered import remembered
 from ..lowering.schedule import SparseStep, Step, StepEquation
-from ..model.group import Group, Point
+from ..model.group import Point, QuantityGroup
 from ..model.opaque import Networks
 from ..model.tables import ZERO
 from ..model.typical_sizes import typical_sizes
@@ -138,7 +138,7 @@ def examine_blocks(
     yield from _constraints(plan, known)
 
 
-def _in_blocks(step: Step, of_slots: Callable[[Group], np.ndarray]) -> np.ndarray:
+def _in_blocks(step: Step, of_slots: Callable[[QuantityGroup], np.ndarray]) -> np.ndarray:
     """Numbers by slots, (n, slots) of each of a step's equations, as matrices of its n blocks, shape (n, k, k)."""
     k = len(step.unknown)
     out = np.zeros((step.n, k, k))

@@ -6,6 +6,7 @@ triangular one, so that solving it is the substitution the steps would have been
 for each template instead of one for each step.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -69,14 +70,8 @@ def _one(steps: Sequence[Step]) -> SparseStep:
     for step in steps:
         for equation in step.equations:
             grouped.setdefault(equation.template.key, []).append(equation)
-    equations = tuple(_joined(same) for same in grouped.values())
+    joined = map(StepEquation.joined, grouped.values())
+    equations = tuple(dataclasses.replace(e, local=(-1,) * len(e.local)) for e in joined)
     unknown = np.concatenate([quantities for step in steps for quantities in step.unknown])
     blocks = tuple(np.zeros(len(e.equation), np.int64) for e in equations)
     return SparseStep(steps[0].level, equations, (unknown,), np.zeros(len(unknown), np.int64), blocks, True)
-
-
-def _joined(equations: Sequence[StepEquation]) -> StepEquation:
-    columns = ("equation", "quantity", "factor", "parameter", "coefficient")
-    joined = (np.concatenate([getattr(e, column) for e in equations]) for column in columns)
-    template = equations[0].template
-    return StepEquation(template, *joined, local=(-1,) * len(template.slots))

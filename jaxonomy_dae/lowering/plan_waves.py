@@ -14,6 +14,7 @@ from ..expressions.differentiate import partial_derivative
 from ..expressions.node import ZERO, Node, leaf, linear, postorder, power
 from ..expressions.node import constant as number
 from ..expressions.substitute import rebuilt, substitute
+from ..model.group import Group
 from ..model.symbolic import SymbolicTemplate, number_label, parameter_label, template_of
 from ..model.template import AbstractTemplate
 from ..modeling.symbols import TIME_LABEL
@@ -31,31 +32,28 @@ Wave = tuple[SymbolicTemplate, SymbolicTemplate | None, SymbolicTemplate | None]
 
 
 @dataclasses.dataclass(frozen=True)
-class WaveGroup:
-    """Waves of one form sin(ωt + φ): templates without slots for ω and φ, None for a phase that moves; and for what is
-    zero if nothing depends on the wave, as where its amplitude is zero, None where that is not known."""
+class WaveGroup(Group):
+    """Waves of one form sin(ωt + φ): templates without slots for ω, `template`, and for φ, None for a phase that moves;
+    and for what is zero if nothing depends on the wave, as where its amplitude is zero; None where that is unknown."""
 
-    frequency: SymbolicTemplate
     phase: SymbolicTemplate | None
     weight: SymbolicTemplate | None
-    parameter: np.ndarray  # (n, parameters)
-    coefficient: np.ndarray  # (n, coefficients)
 
 
 def plan_waves(steps: Sequence[AnyStep]) -> tuple[WaveGroup, ...]:
     """The waves in the equations of these steps, each once."""
-    found: dict[Wave, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for step in steps:
-        for equation in step.equations:
-            for wave in _waves(equation.template):
-                found.setdefault(wave, []).append((equation.parameter, equation.coefficient))
-    groups = []
-    for wave, tables in found.items():
-        parameter, coefficient = (np.concatenate(column) for column in zip(*tables, strict=True))
-        _, first = np.unique(np.hstack([parameter, coefficient]), axis=0, return_index=True)
-        rows = np.sort(first)
-        groups.append(WaveGroup(*wave, parameter[rows], coefficient[rows]))
-    return tuple(groups)
+    found: dict[Wave, list[WaveGroup]] = {}
+    for equation in (equation for step in steps for equation in step.equations):
+        for wave in _waves(equation.template):
+            none, (frequency, *others) = np.zeros((len(equation), 0)), wave
+            group = WaveGroup(frequency, none, equation.parameter, equation.coefficient, *others)
+            found.setdefault(wave, []).append(group)
+    groups = map(WaveGroup.joined, found.values())
+    return tuple(group.take(np.sort(_first_of_each(group))) for group in groups)
+
+
+def _first_of_each(group: WaveGroup) -> np.ndarray:
+    return np.unique(np.hstack([group.parameter, group.coefficient]), axis=0, return_index=True)[1]
 
 
 @functools.lru_cache(maxsize=4096)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..compiler.order_blocks import Blocks
 from ..model.extended import Extended, ExtendedGroup
-from ..model.group import Group
+from ..model.group import QuantityGroup
 from ..model.tables import ZERO
 from ..structure.integers import distinct, equal_rows
 from ..structure.tearing import BlockSizes, Tearing, tear
@@ -31,7 +31,7 @@ WRITTEN_OUT = {True: 20, False: 200}  # by whether the block is linear
 
 
 @dataclasses.dataclass(frozen=True)
-class StepEquation(Group):
+class StepEquation(QuantityGroup):
     """One equation of each of a step's n blocks."""
 
     local: tuple[int, ...]  # the local unknown in each slot; −1: quantities from outside
@@ -296,15 +296,8 @@ def _single_steps(group: ExtendedGroup, g: int, row_of, blocks: Blocks, places, 
 
 def equation_of(group: ExtendedGroup, rows: np.ndarray, local: dict[int, int]) -> StepEquation:
     """Some instances of a group, whose slots hold these local unknowns."""
-    return StepEquation(
-        group.template,
-        group.equation[rows],
-        group.quantity[rows],
-        group.factor[rows],
-        group.parameter[rows],
-        group.coefficient[rows],
-        tuple(local.get(k, -1) for k in range(group.quantity.shape[1])),
-    )
+    columns = [getattr(group, f.name) for f in dataclasses.fields(QuantityGroup)]
+    return StepEquation(*columns, local=tuple(local.get(k, -1) for k in range(group.quantity.shape[1]))).take(rows)
 
 
 class _Block(NamedTuple):

@@ -12,12 +12,12 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from .extended import Extended, ExtendedGroup
-from .group import Point
+from .group import Columns, Point
 from .tables import ZERO, EquationGroup, equation_offsets
 
 
 @dataclasses.dataclass(frozen=True)
-class ConstraintEntries:
+class ConstraintEntries(Columns):
     """Entries of the constraint Jacobian: ∂F_row/∂(variable column), at the matching orders."""
 
     row: np.ndarray
@@ -26,9 +26,6 @@ class ConstraintEntries:
     group: np.ndarray
     instance: np.ndarray
     slot: np.ndarray
-
-    def take(self, which: np.ndarray) -> "ConstraintEntries":
-        return ConstraintEntries(*(getattr(self, field.name)[which] for field in dataclasses.fields(self)))
 
 
 def constraint_entries(groups: tuple[EquationGroup, ...], extended: Extended) -> ConstraintEntries:

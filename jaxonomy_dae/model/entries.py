@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 
 from ..structure.incidence import Incidence, compress
+from .group import Columns
 from .tables import ZERO, EquationGroup
 
 
 @dataclasses.dataclass(frozen=True)
-class Entries:
+class Entries(Columns):
     """The entries (equation, variable, order) of all groups; `coefficient` is NaN unless it is a number."""
 
     row: np.ndarray
@@ -17,11 +18,6 @@ class Entries:
     order: np.ndarray
     coefficient: np.ndarray
     n_rows: int
-
-    def take(self, which: np.ndarray) -> "Entries":
-        return Entries(
-            self.row[which], self.variable[which], self.order[which], self.coefficient[which], self.n_rows
-        )  # fmt: skip
 
 
 def entries_of(groups: tuple[EquationGroup, ...], unknown: np.ndarray) -> Entries:

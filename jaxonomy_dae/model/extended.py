@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 
 from ..structure.incidence import compress
-from .group import Group
+from .group import QuantityGroup
 from .tables import ZERO
 
 
@@ -45,7 +45,7 @@ class Quantities:
 
 
 @dataclasses.dataclass(frozen=True)
-class ExtendedGroup(Group):
+class ExtendedGroup(QuantityGroup):
     """Instances of one template at one level of differentiation."""
 
     base: np.ndarray  # the equation as written that each comes from (n,)

@@ -8,8 +8,7 @@ import scipy.sparse as sp
 from jaxtyping import Float
 
 from ..linear.graph_elimination import GraphElimination
-from .extended import ExtendedGroup
-from .group import Group, Point
+from .group import Point, QuantityGroup
 from .jacobian import generic
 from .tables import ZERO
 
@@ -52,7 +51,7 @@ class _Seen(NamedTuple):
 
 
 def natural_sizes(
-    groups: Sequence[ExtendedGroup],
+    groups: Sequence[QuantityGroup],
     n_equations: int,
     size: Float[np.ndarray, " n"],
     parameters: Float[np.ndarray, " p"],
@@ -150,7 +149,7 @@ def _moved(size: np.ndarray, decades: np.ndarray) -> np.ndarray:
     return np.where(decades == 0.0, size, np.sign(size) * 10.0**limited)
 
 
-def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> _Seen:
+def _constants(groups: Sequence[QuantityGroup], parameters: np.ndarray) -> _Seen:
     """|F_e| where all quantities are zero; none that reads a parameter without a value."""
     values, equations = [np.zeros(0)], [np.zeros(0, np.int64)]
     quantities = 1 + max((int(g.quantity.max(initial=-1)) for g in groups), default=0)
@@ -167,7 +166,7 @@ def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> _Seen
 
 
 def _seen(
-    groups: Sequence[ExtendedGroup], quantity: np.ndarray, parameter: np.ndarray, of: type["_Entries"] | type["_Terms"]
+    groups: Sequence[QuantityGroup], quantity: np.ndarray, parameter: np.ndarray, of: type["_Entries"] | type["_Terms"]
 ) -> _Seen:
     """Evaluates the entries, or the terms, of the groups at a generic point. Entries are multiplied by the sizes of the
     quantities to which they belong."""
@@ -232,11 +231,11 @@ class _Entries:
     """|∂F_e/∂x_q| for each slot."""
 
     @staticmethod
-    def sizes(group: Group, quantities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    def sizes(group: QuantityGroup, quantities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         return np.abs(group.partials(Point.of(quantities.ravel(), parameters.ravel(), 0.5)))
 
     @staticmethod
-    def read(group: Group) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
+    def read(group: QuantityGroup) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
         return group.template.readers_of_partials()
 
 
@@ -244,11 +243,11 @@ class _Terms:
     """|term| for each term of F_e."""
 
     @staticmethod
-    def sizes(group: Group, quantities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    def sizes(group: QuantityGroup, quantities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         return np.abs(group.terms(Point.of(quantities.ravel(), parameters.ravel(), 0.5)))
 
     @staticmethod
-    def read(group: Group) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
+    def read(group: QuantityGroup) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
         return group.template.readers_of_terms()
 
 

@@ -80,7 +80,7 @@ class Provenances(Sequence[Provenance]):
         written = [w for _, w in places]
         return cls(sources, written, np.concatenate(source) if parts else item, item)
 
-    def take(self, rows: np.ndarray) -> "Provenances":
+    def take(self, rows: np.ndarray | list[int] | slice) -> "Provenances":
         """The provenances of some rows."""
         return Provenances(self._sources, self._written, self._source[rows], self._item[rows])
 

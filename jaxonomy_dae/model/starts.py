@@ -7,6 +7,7 @@ from typing import Any, overload
 import jax.numpy as jnp
 import numpy as np
 
+from .group import Group
 from .symbolic import SymbolicTemplate
 
 
@@ -23,26 +24,27 @@ class Start:
 
 
 @dataclasses.dataclass(frozen=True)
-class Formulas:
+class Formulas(Group):
     """Numbers that one template without slots computes, each from its own parameters."""
 
-    template: SymbolicTemplate
     target: np.ndarray  # (n,): what the numbers are of
-    parameter: np.ndarray  # (n, parameters of the template)
 
-    def take(self, rows: np.ndarray) -> "Formulas":
-        """Some of the numbers."""
-        return Formulas(self.template, self.target[rows], self.parameter[rows])
+    @classmethod
+    def of(cls, template: SymbolicTemplate, target: Any, parameter: Any) -> "Formulas":
+        """Formulas by rows."""
+        n = len(target)
+        read = np.array(parameter, np.int64).reshape(n, template.n_parameters)
+        return cls(template, np.zeros((n, 0)), read, np.zeros((n, 0)), np.array(target, np.int64))
 
     def put(self, array: Any, parameters: Any, t: Any = 0.0) -> Any:
         """The array with the numbers at their targets, in its last axis; in NumPy it is changed. Numbers that are not
         finite are named by those who call."""
-        given = [parameters[..., column] for column in self.parameter.T]
+        given = self.numbers(parameters)
         if isinstance(array, np.ndarray):
             with np.errstate(all="ignore"):
-                array[..., self.target] = self.template.residual([], given, [], t, None, backend="numpy")
+                array[..., self.target] = self.template.residual([], *given, t, None, backend="numpy")
             return array
-        return array.at[..., self.target].set(jnp.asarray(self.template.residual([], given, [], t, None), array.dtype))
+        return array.at[..., self.target].set(jnp.asarray(self.template.residual([], *given, t, None), array.dtype))
 
 
 def formulas_of(starts: Sequence[Start | None]) -> list[Formulas]:
@@ -50,8 +52,7 @@ def formulas_of(starts: Sequence[Start | None]) -> list[Formulas]:
     found = []
     for template in dict.fromkeys(start.template for start in starts if start):
         rows = [(k, start.parameters) for k, start in enumerate(starts) if start and start.template is template]
-        places, parameters = zip(*rows, strict=True)
-        found.append(Formulas(template, np.array(places), np.array(parameters, np.int64)))
+        found.append(Formulas.of(template, *zip(*rows, strict=True)))
     return found
 
 

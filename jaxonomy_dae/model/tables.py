@@ -7,7 +7,7 @@ of integers. After alias elimination a slot also has a factor, and variable −1
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,12 +15,13 @@ from ..aliases import Numeric
 from ..modeling.interval import Interval
 from .array_names import ArrayNames
 from .events import NO_EVENTS, NONE_HELD, EventTable, HeldTable
+from .group import Group
 from .opaque import OpaqueFunction
 from .provenance import Provenance, Provenances
 from .starts import Formulas, Starts
-from .symbolic import SymbolicTemplate
 from .template import AbstractTemplate
 
+E = TypeVar("E", bound="EquationGroup")
 ZERO = -1  # stands for a variable, or quantity, that is identically zero
 
 
@@ -102,30 +103,31 @@ class ParameterTable:
 
 
 @dataclasses.dataclass(frozen=True)
-class EquationGroup:
-    """All instances of one template: instance i's slot k is factor[i, k]·(variable[i, k])^(order[i, k])."""
+class EquationGroup(Group):
+    """Equations in variables: instance i's slot k is factor[i, k]·(variable[i, k])^(order[i, k])."""
 
-    template: AbstractTemplate
     variable: np.ndarray
     order: np.ndarray
-    factor: np.ndarray
-    parameter: np.ndarray
-    coefficient: np.ndarray
     provenance: Provenances
 
-    def __len__(self):
-        return self.variable.shape[0]
-
-    def take(self, rows) -> "EquationGroup":
-        rows = np.asarray(rows, dtype=np.int64)
-        return EquationGroup(
-            self.template,
-            self.variable[rows],
-            self.order[rows],
-            self.factor[rows],
-            self.parameter[rows],
-            self.coefficient[rows],
-            self.provenance.take(rows),
+    @classmethod
+    def of(
+        cls: type[E], template: AbstractTemplate, variable: Any, order: Any, provenance: Provenances, *,
+        parameter: Any = None, coefficient: Any = None, **more: Any,
+    ) -> E:  # fmt: skip
+        """A group without factors. Parameters and coefficients are left out where the template has none."""
+        n = len(provenance)
+        parameter, coefficient = (np.zeros((n, 0)) if given is None else given for given in (parameter, coefficient))
+        variable, order = (np.asarray(given, np.int64).reshape(n, -1) for given in (variable, order))
+        return cls(
+            template=template,
+            factor=np.ones(variable.shape),
+            parameter=np.asarray(parameter, np.int64).reshape(n, template.n_parameters),
+            coefficient=np.asarray(coefficient, float).reshape(n, template.n_coefficients),
+            variable=variable,
+            order=order,
+            provenance=provenance,
+            **more,
         )
 
 
@@ -139,19 +141,11 @@ class RowInjection:
 
 
 @dataclasses.dataclass(frozen=True)
-class AccountGroup:
-    """Energies or powers that components declare: instance i of one template, whose slot k is
-    (variable[i, k])^(order[i, k])."""
+class AccountGroup(EquationGroup):
+    """Energies or powers that components declare, in place of residuals."""
 
     kind: str
-    template: SymbolicTemplate
-    variable: np.ndarray
-    order: np.ndarray
-    parameter: np.ndarray
     component: np.ndarray
-
-    def __len__(self):
-        return len(self.component)
 
 
 @dataclasses.dataclass(frozen=True)

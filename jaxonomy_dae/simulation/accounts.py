@@ -77,8 +77,7 @@ def _at_one_time(system: AcausalSystem, t: Time, x: State, inputs: Args) -> Nume
     parts = []
     for group, (quantity, factor, missing) in zip(plan.flat.accounts, slots, strict=True):
         read = jnp.where(missing, slopes[quantity], values[quantity]) * jnp.asarray(factor, values.dtype)
-        parameters = [array[column] for column in group.parameter.T]
-        value = group.template.residual(list(read.T), parameters, [], t, networks)
+        value = group.template.residual(list(read.T), *group.numbers(array), t, networks)
         parts.append(jnp.broadcast_to(jnp.asarray(value, values.dtype), (len(group),)))
     return jnp.concatenate(parts)
 

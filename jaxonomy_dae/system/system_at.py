@@ -391,14 +391,13 @@ class SystemAt:
         xp: ModuleType = np if known else jnp
         numbers, t = (np.asarray(self.parameters), np.asarray(self.t)) if known else (self.parameters, self.t)
         for group in self.plan.waves:
-            n = len(group.parameter)
-            given = [numbers[column] for column in group.parameter.T], list(group.coefficient.T)
+            n, given = len(group), group.numbers(numbers)
 
             def values(template, n=n, given=given):
                 found = template.residual([], *given, t, None, backend="numpy" if known else "jax")
                 return xp.broadcast_to(xp.asarray(found, self.dtype), (n,))
 
-            frequency = values(group.frequency)
+            frequency = values(group.template)
             if group.weight is not None and not differentiated and not is_traced(self.parameters):
                 frequency = xp.where(values(group.weight) == 0.0, 0.0, frequency)
             frequencies.append(frequency)

@@ -23,11 +23,10 @@ def waves(system):
     plan, found = system.plan, set()
     values = plan.flat.parameters.everything(system.parameters.known)
     for group in plan.waves:
-        given = [values[c] for c in group.parameter.T], list(group.coefficient.T)
-        n = len(group.parameter)
+        n, given = len(group), group.numbers(values)
         both = [
             np.full(n, np.nan) if part is None else np.broadcast_to(part.residual([], *given, 0.0, None, "numpy"), (n,))
-            for part in (group.frequency, group.phase)
+            for part in (group.template, group.phase)
         ]
         found |= {(float(f"{w:.12g}"), float(f"{p:.12g}")) for w, p in zip(*both, strict=True)}
     return found
