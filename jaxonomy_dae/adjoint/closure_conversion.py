@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 
 from ..aliases import Args, Result, State
 from ..private_names import MissingName, private
+from .parts_of_constants import parts_of_constants
 
 
 class SolveProgram(eqx.Module):
@@ -82,13 +83,14 @@ def closure_convert(function: Any, *args: Args) -> tuple[ClosureConverted, list[
     out_structure, (others, others_structure) = found
     shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.out_avals)
     evaluate = private("eval_jaxpr")
+    program, constants = parts_of_constants(closed.jaxpr, list(closed.consts))
 
     @jax.jit
     def call(consts, *leaves):
-        return evaluate(closed.jaxpr, consts, *leaves)
+        return evaluate(program, consts, *leaves)
 
     converted = ClosureConverted(call, structure, (out_structure, shapes), (tuple(others), others_structure))
-    return converted, list(closed.consts)
+    return converted, constants
 
 
 def by_itself_or_batched(
