@@ -157,6 +157,7 @@ def _extended(variables: VariableTable, names: list[str], first_internal: int) -
         default=[*variables.default, *[None] * extra],
         owner=np.append(variables.owner, np.full(extra, -1)),
         port=np.append(variables.port, np.full(extra, -1)),
-        is_across=np.append(variables.is_across, no),
+        potential=np.append(variables.potential, np.full(extra, -1)),
+        potentials=variables.potentials,
         is_internal=np.append(variables.is_internal, np.arange(len(variables), len(names)) >= first_internal),
     )

@@ -18,7 +18,8 @@ from .read_equations import read_expression
 
 
 def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
-    records: list[tuple[Variable, int, bool]] = []  # declared variables, each with its port and whether it is across
+    records: list[tuple[Variable, int, int]] = []  # variables as declared, each with its port and its potential
+    potentials: dict[tuple[str, str], int] = {}
     record = np.empty(model.n_variables, np.int64)
     owner = np.empty(model.n_variables, np.int64)
     places: list[int] = []
@@ -28,14 +29,14 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
     for i in model.instances:
         component = i.component
         in_port = {
-            f"{p.name}.{name}": (j, across)
+            f"{p.name}.{name}": (j, potentials.setdefault((p.domain.name, name), len(potentials)) if is_across else -1)
             for j, p in enumerate(component.ports.values())
-            for table, across in ((p.domain.across, True), (p.domain.through, False))
+            for table, is_across in ((p.domain.across, True), (p.domain.through, False))
             for name, _ in table
         }
         first = len(records)
         for k, variable in enumerate(component.variables.values()):
-            records.append((variable, *in_port.get(variable.name, (-1, False))))
+            records.append((variable, *in_port.get(variable.name, (-1, -1))))
             if variable.start is not None:
                 started.append((variable, i, k))
         n = len(component.variables)
@@ -75,7 +76,8 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
         default=default.tolist(),
         owner=owner,
         port=port,
-        is_across=column(lambda v, p, a: a, bool),
+        potential=column(lambda v, p, a: a, np.int64),
+        potentials=tuple(potentials),
         is_internal=column(lambda v, p, a: v.kind in ("start", "event"), bool),
     )
 

@@ -14,9 +14,11 @@ from ..diagnosis.wording import itemised
 from ..errors import StructuralError
 from ..model.quantities import ReducedModel
 from ..model.tables import provenance_of
-from ..structure.integers import distinct
+from ..structure.integers import distinct, ranges
 from ..structure.matching import maximum_matching
 from .select_states import StateSelection
+
+MANY = 50  # blocks whose followers are found faster by array operations than one by one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,17 +103,24 @@ def _levels(block: np.ndarray, needs: np.ndarray, n_blocks: int) -> np.ndarray:
     outside = block != needs
     first, second = np.divmod(distinct(needs[outside] * np.int64(n_blocks) + block[outside]), max(n_blocks, 1))
     waiting = np.bincount(second, minlength=n_blocks)
-    start = np.concatenate([[0], np.cumsum(np.bincount(first, minlength=n_blocks))]).tolist()
-    followers = second.tolist()
-    level = [0] * n_blocks
-    waiting_list = waiting.tolist()
-    ready = np.flatnonzero(waiting == 0).tolist()
-    while ready:
-        b = ready.pop()
-        for k in range(start[b], start[b + 1]):
+    start = np.append(0, np.cumsum(np.bincount(first, minlength=n_blocks)))
+    level, depth = np.zeros(n_blocks, np.int64), 0
+    ready = np.flatnonzero(waiting == 0)
+    while len(ready) >= MANY:  # all blocks of a level at once
+        level[ready] = depth
+        followers = second[ranges(start[ready], start[ready + 1] - start[ready])]
+        np.subtract.at(waiting, followers, 1)
+        ready, depth = distinct(followers[waiting[followers] == 0]), depth + 1
+    if not len(ready):
+        return level
+    level[ready] = depth
+    stack, starts, followers, left, found = (a.tolist() for a in (ready, start, second, waiting, level))
+    while stack:
+        b = stack.pop()
+        for k in range(starts[b], starts[b + 1]):
             f = followers[k]
-            level[f] = max(level[f], level[b] + 1)
-            waiting_list[f] -= 1
-            if waiting_list[f] == 0:
-                ready.append(f)
-    return np.array(level, np.int64)
+            found[f] = max(found[f], found[b] + 1)
+            left[f] -= 1
+            if left[f] == 0:
+                stack.append(f)
+    return np.array(found, np.int64)

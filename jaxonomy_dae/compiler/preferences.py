@@ -3,17 +3,17 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Int
 
 from ..diagnosis.wording import listed
 from ..errors import ModelError, nearest
 from ..model.quantities import ReducedModel
 from ..model.tables import FlatModel
 
-Merit = tuple[int, int, int]  # how strongly it was asked for, whether it is fixed at the start, and has a start
 
-
-def merits(model: ReducedModel, prefer_states: Sequence[str]) -> list[Merit]:
-    """For each quantity, how much it should be a state; of quantities that compete, those with larger tuples are kept.
+def merits(model: ReducedModel, prefer_states: Sequence[str]) -> Int[np.ndarray, "quantities 3"]:
+    """For each quantity, how strongly it was asked for as a state, whether it is fixed at the start, and has a start:
+    of quantities that compete, those with larger rows are kept.
 
     **Raises:**
 
@@ -33,7 +33,7 @@ def merits(model: ReducedModel, prefer_states: Sequence[str]) -> list[Merit]:
         q, _ = variables[index[name]]
         if q >= 0 and not asked[q]:
             asked[q] = len(wanted) - k
-    return list(zip(asked.tolist(), fixed.tolist(), started.tolist(), strict=True))
+    return np.stack([asked, fixed, started], axis=1)
 
 
 def note_not_followed(model: ReducedModel, prefer_states: Sequence[str], states: np.ndarray) -> tuple[str, ...]:

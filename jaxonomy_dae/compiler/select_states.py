@@ -11,7 +11,6 @@ motion) is set apart first: it is known and not a state.
 """
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -27,7 +26,6 @@ from ..model.quantities import ReducedModel
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 from ..model.typical_sizes import typical_sizes, unrounded_sizes
 from ..tolerances import ALIKE, KNOWN
-from .preferences import Merit
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
 POORER_PIVOT = 1e-3  # so much smaller if the better ones would all be of preferred states
@@ -84,7 +82,7 @@ def _settled(groups: tuple[EquationGroup, ...], extended: Extended, c: np.ndarra
     return found_rows, found_columns
 
 
-def select_states(model: ReducedModel, mode: str, merit: Sequence[Merit]) -> StateSelection:
+def select_states(model: ReducedModel, mode: str, merit: np.ndarray) -> StateSelection:
     """Selects states.
 
     **Arguments:**
@@ -116,8 +114,7 @@ def select_states(model: ReducedModel, mode: str, merit: Sequence[Merit]) -> Sta
         entries = entries.take(~alone[entries.row] & ~np.isin(entries.column, columns))
         notes += [
             f"{model.names[q]} was preferred as a state, but equations without states determine it"
-            for q in np.flatnonzero(is_dummy).tolist()
-            if merit[q][0] > 0
+            for q in np.flatnonzero(is_dummy & (merit[: len(is_dummy), 0] > 0)).tolist()
         ]
     constrained = np.flatnonzero((c > 0) & ~alone)
 
@@ -179,7 +176,7 @@ def _dependence(model: ReducedModel, settled: np.ndarray, at: Point, rows: np.nd
     )
 
 
-def _dummy_derivatives(model: ReducedModel, dense, errors, c, columns, merit: Sequence[Merit], scale):
+def _dummy_derivatives(model: ReducedModel, dense, errors, c, columns, merit: np.ndarray, scale):
     """Mattsson & Söderlind's selection, level by level: the candidate quantities that become dummies, None if rows
     depend on each other; and notes."""
     quantities = model.extended.quantities
@@ -192,7 +189,7 @@ def _dummy_derivatives(model: ReducedModel, dense, errors, c, columns, merit: Se
         # If the (d − level + 1)-th derivative is a dummy, the quantity below it is not a state.
         below = quantities.first[columns[available]] + quantities.highest[columns[available]] - level
         inside = np.ix_(rows, available)
-        keys = [(merit[q], -q) for q in below.tolist()]
+        keys = [(*merit[q].tolist(), -q) for q in below.tolist()]
         picked = _pivots(dense[inside] * scale[below], errors[inside] * scale[below], keys)
         if picked is None:
             return None, notes
@@ -249,5 +246,4 @@ def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[i
 
 
 def _is_preferred(key: tuple) -> bool:
-    (preference, *_), _ = key
-    return preference > 0
+    return key[0] > 0

@@ -4,6 +4,7 @@ Given equations of the flattened model that depend on each other, finds the fewe
 wrote these, and what their ports share.
 """
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,8 +24,16 @@ class Explainer:
         self.flat = flat
         self.entries = entries
         self.determined_by = determined_by
-        self.start = np.searchsorted(entries.row, np.arange(entries.n_rows + 1))
-        self.number = {name: k for k, name in enumerate(flat.components)}
+
+    @functools.cached_property
+    def start(self) -> np.ndarray:
+        """Where the entries of each equation begin."""
+        return np.searchsorted(self.entries.row, np.arange(self.entries.n_rows + 1))
+
+    @functools.cached_property
+    def number(self) -> dict[str, int]:
+        """The components' numbers by name."""
+        return {name: k for k, name in enumerate(self.flat.components)}
 
     def behind(self, rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Returns (the equations `rows` with those that determine their known variables, all variables in them),

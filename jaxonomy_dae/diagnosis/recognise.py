@@ -84,10 +84,11 @@ def _known(entries: Entries, n_variables: int) -> tuple[np.ndarray, list[int]]:
     queue = collections.deque(np.flatnonzero(count == 1).tolist())
     if not queue:
         return determined_by, twice
-    by_variable = np.argsort(entries.variable, kind="stable").tolist()
-    start = np.append(0, np.cumsum(np.bincount(entries.variable, minlength=n_variables))).tolist()
-    row_of, variable_of, order_of = entries.row.tolist(), entries.variable.tolist(), entries.order.tolist()
-    left, last = count.tolist(), np.rint(total).astype(np.int64).tolist()  # the sum of the numbers of unknown entries
+    # Views, not lists: of a large model, few entries are looked at.
+    by_variable = np.argsort(entries.variable, kind="stable").data
+    start = np.append(0, np.cumsum(np.bincount(entries.variable, minlength=n_variables))).data
+    row_of, variable_of, order_of = entries.row.data, entries.variable.data, entries.order.data
+    left, last = count.data, np.rint(total).astype(np.int64).data  # the sum of the numbers of unknown entries
     while queue:
         row = queue.popleft()
         if left[row] != 1 or order_of[last[row]] != 0:
@@ -215,13 +216,9 @@ def _cuts(flat: FlatModel, groups, alias: AliasTable, known: np.ndarray) -> list
 def _floating(flat: FlatModel, groups, alias: AliasTable) -> tuple[list[str], set[str]]:
     """Networks whose across variables have no level: sentences, and the components concerned."""
     variables, ports = flat.variables, flat.ports
-    across = np.flatnonzero(variables.is_across)
-    kinds: dict[tuple[str, str], list[int]] = {}
-    for v, port in zip(across.tolist(), variables.port[across].tolist(), strict=True):
-        kinds.setdefault((ports.domains[port], variables.names[v].rsplit(".", 1)[1]), []).append(v)
     texts, components = [], set()
-    for (domain, name), members in kinds.items():
-        for island in _islands(flat, groups, alias, np.array(members)):
+    for k, (domain, name) in enumerate(variables.potentials):
+        for island in _islands(flat, groups, alias, np.flatnonzero(variables.potential == k)):
             numbers = np.unique(variables.owner[island])
             owners = [flat.components[c] for c in numbers]
             loose = [ports.names[p] for p in np.unique(variables.port[island]) if ports.is_loose[p]]

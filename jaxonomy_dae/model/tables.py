@@ -40,8 +40,14 @@ class VariableTable:
     default: list[float | None]
     owner: np.ndarray  # the component, −1 for variables of neural blocks
     port: np.ndarray  # the port it belongs to, −1 if none
-    is_across: np.ndarray
+    potential: np.ndarray  # of across variables of ports, the place in `potentials`; else −1
+    potentials: tuple[tuple[str, str], ...]  # (domain, name)
     is_internal: np.ndarray  # made by the compiler, and not to be read by users
+
+    @property
+    def is_across(self) -> np.ndarray:
+        """True for across variables of ports."""
+        return self.potential >= 0
 
     @functools.cached_property
     def index(self) -> dict[str, int]:

@@ -16,6 +16,12 @@ def distinct(numbers: Int[np.ndarray, "..."]) -> Int[np.ndarray, " distinct"]:
     return found[np.append(True, found[1:] != found[:-1])] if len(found) else found
 
 
+def ranges(start: Int[np.ndarray, " n"], count: Int[np.ndarray, " n"]) -> Int[np.ndarray, " total"]:
+    """start[0], start[0] + 1, …, start[0] + count[0] − 1, start[1], …"""
+    end = np.cumsum(count)
+    return np.repeat(start - end + count, count) + np.arange(end[-1] if len(end) else 0)
+
+
 def equal_rows(columns: Sequence[Integer[np.ndarray, " rows"]]) -> list[np.ndarray]:
     """Sets of rows that are equal in all columns, in the order of the first row of each; their rows ascend."""
     by = np.lexsort(tuple(columns))

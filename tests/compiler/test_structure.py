@@ -122,6 +122,26 @@ def test_matchings_are_as_large_as_scipys(matrix, rows):
     assert len(matched) == np.count_nonzero(expected >= 0)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_large_matchings_are_as_large_as_scipys(seed):
+    """Chains peel by one pair a round, stars and random patterns by many; some have no perfect matching."""
+    rng, n = np.random.default_rng(seed), 4000
+    k = np.arange(n)
+    patterns = [
+        (np.concatenate([k, k[1:]]), np.concatenate([k, k[:-1]])),  # a chain
+        (np.concatenate([k, k]), np.concatenate([k, np.zeros_like(k)])),  # a star
+        (np.repeat(k, 2), rng.integers(0, n, 2 * n)),
+        (np.concatenate([k, rng.integers(0, n, n)]), np.concatenate([rng.permutation(n), rng.integers(0, n, n)])),
+    ]
+    row, column = patterns[seed % 4]
+    graph = csr_array((np.ones(len(row)), (rng.permutation(n)[row], column)), shape=(n, n))
+    graph.sum_duplicates()
+    found = maximum_matching(graph.indptr.astype(np.int64), graph.indices.astype(np.int64), n)
+    matched = np.flatnonzero(found >= 0)
+    assert graph[matched, found[matched]].all() and len(set(found[matched].tolist())) == len(matched)
+    assert len(matched) == np.count_nonzero(maximum_bipartite_matching(graph, perm_type="column") >= 0)
+
+
 # --- tearing -----------------------------------------------------------------------------------------------------
 
 
