@@ -1,6 +1,6 @@
 """Which modes follow from what was before an instant alone: none of this kind takes back what another one does."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 
 import sympy
 
@@ -8,7 +8,7 @@ from ..errors import ModelError
 from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 from .definitions import OfAlgorithm, with_entries
 from .scope import Scope
-from .tree import Call, Equality, Expression, Reference
+from .tree import Call, Equality, Expression, Reference, each_part
 from .values import Value
 
 
@@ -20,7 +20,11 @@ class BeforeOnly:
         self.scope = scope
         equations = scope.definitions.equations
         self.by_when = set(with_entries(by_when, scope.flat.model))
-        self.states = {scope.interpreter.name_of(e) for s in equations for e in _differentiated(s)}
+        self.states = {
+            scope.interpreter.name_of(e.arguments[0])
+            for e in each_part(tuple(equations))
+            if isinstance(e, Call) and e.function == "der" and isinstance(e.arguments[0], Reference)
+        }
         self.given: dict[str, list[Expression]] = {}
         for s in equations:
             if isinstance(s, Equality) and not isinstance(s.right, OfAlgorithm):
@@ -31,7 +35,8 @@ class BeforeOnly:
 
     def is_mode(self, name: str) -> bool:
         """True for a mode of this kind."""
-        return self._is(self._at_event(lambda: self.scope.defined(name, self.scope.definitions.of[name])))
+        with self.scope.at_event():
+            return self._is(self.scope.defined(name, self.scope.definitions.of[name]))
 
     def _is(self, value: Value) -> bool:
         symbols = value.free_symbols if isinstance(value, sympy.Basic) else set()
@@ -52,24 +57,7 @@ class BeforeOnly:
 
     def _is_expression(self, e: Expression) -> bool:
         try:
-            return self._is(self._at_event(lambda: self.scope.evaluate(e)))
+            with self.scope.at_event():
+                return self._is(self.scope.evaluate(e))
         except ModelError:
             return False
-
-    def _at_event(self, evaluate: Callable) -> Value:
-        self.scope.in_action = True
-        try:
-            return evaluate()
-        finally:
-            self.scope.in_action = False
-
-
-def _differentiated(statement: object) -> Iterator[Reference]:
-    """The variables in der(…)."""
-    stack = [statement]
-    while stack:
-        e = stack.pop()
-        if isinstance(e, Call) and e.function == "der" and isinstance(e.arguments[0], Reference):
-            yield e.arguments[0]
-        if isinstance(e, tuple):
-            stack.extend(e)

@@ -6,13 +6,13 @@ those of the text with that beginning.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from .builtin import FUNCTIONS
 from .flat_model import FlatModel
 from .library import Constant, Found, Library, Member
-from .tree import Call, Class, Comprehension, Declaration, Effect, Loop, Part, Reference
+from .tree import Call, Class, Comprehension, Declaration, Effect, Loop, Part, Reference, each_part
 
 _BUILT_IN = ("Real", "Integer", "Boolean", "String")
 _RECORDS = ("record", "class")
@@ -23,7 +23,7 @@ def completed(flat: FlatModel, library: Library, known: frozenset[str]) -> FlatM
     that need none."""
     classes = dict(flat.classes)
     writer = _Writer(library, classes)
-    for name in dict.fromkeys(_called([flat.model, *flat.classes.values()])):
+    for name in dict.fromkeys(e.function for e in each_part((flat.model, classes)) if isinstance(e, Call)):
         last = name.rpartition(".")[2]
         if (
             name in classes
@@ -37,18 +37,6 @@ def completed(flat: FlatModel, library: Library, known: frozenset[str]) -> FlatM
         if isinstance(found, Found):
             writer.write(found, name)
     return dataclasses.replace(flat, classes=classes)
-
-
-def _called(classes: Sequence[Class]) -> Iterator[str]:
-    stack: list[Any] = list(classes)
-    while stack:
-        e = stack.pop()
-        if isinstance(e, Call):
-            yield e.function
-        if isinstance(e, tuple):
-            stack.extend(e)
-        elif isinstance(e, dict):
-            stack.extend(e.values())
 
 
 def _of_a_part(name: str, flat: FlatModel, library: Library) -> Member | None:
@@ -234,4 +222,4 @@ class _Writer:
             return self._renamed(d.value, constant.scopes, frozenset())
         kind, _ = self._type(d.type, constant.scopes)
         fields = tuple((n, self._renamed(v, constant.scopes, frozenset())) for n, v in d.modifiers.items())
-        return Call(kind, (), fields) if kind in self.classes else Reference((d.name,), ((),))
+        return Call(kind, (), fields) if kind in self.classes else Reference((d.name,))

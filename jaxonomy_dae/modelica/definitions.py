@@ -20,6 +20,7 @@ from .tree import (
     Several,
     Statement,
     Truth,
+    each_part,
 )
 
 
@@ -67,7 +68,7 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
             algorithms.append(rest)
     by_when = set(with_entries((name for s in whens for _, body in s.branches for name in assigned_in(body)), model))
     bindings = [
-        Equality(Reference((d.name,), ((),)), d.value, d.line)
+        Equality(Reference((d.name,)), d.value, d.line)
         for d in model.declarations
         if d.value is not None and is_discrete(d.name)
     ]
@@ -84,9 +85,8 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
             if is_discrete(name):
                 of[name] = k
             else:
-                equations.append(Equality(Reference((name,), ((),)), OfAlgorithm(k, name), section[0].line))  # type: ignore[arg-type]
-    before = (name for s in [*model.equations, *model.algorithms, *bindings] for name in _read_before(s))
-    read_before = set(with_entries(before, model))
+                equations.append(Equality(Reference((name,)), OfAlgorithm(k, name), section[0].line))  # type: ignore[arg-type]
+    read_before = set(with_entries(_read_before((model.equations, model.algorithms, tuple(bindings))), model))
     followed = [name for name in of if name in read_before and name not in by_when]
     return DiscreteDefinitions(
         of=of, stored=by_when | set(followed), followed=followed, equations=equations, whens=whens,
@@ -127,7 +127,7 @@ def _with_choices(statements: Iterable[Statement], is_discrete: Callable[[str], 
         names = [n for n in values[0] if all(n in v for v in values)] if conditions[-1] == Truth(True) else []
         for n in names:
             branches = tuple((c, v[n]) for c, v in zip(conditions[:-1], values, strict=False))
-            out.append(Equality(Reference((n,), ((),)), Choice(branches, values[-1][n]), s.line))
+            out.append(Equality(Reference((n,)), Choice(branches, values[-1][n]), s.line))
         rest = tuple(
             (c, tuple(e for e in body if not (isinstance(e, Equality) and getattr(e.left, "path", None) in names)))
             for c, body in zip(conditions, bodies, strict=True)
@@ -184,8 +184,7 @@ def assigned_in(statements: tuple[Statement, ...]) -> Iterator[str]:
     """The names that equations or assignments determine by standing on their left."""
     for s in statements:
         if isinstance(s, Equality | Assignment):
-            target = s.left if isinstance(s, Equality) else s.target
-            for each in target.entries if isinstance(target, Several) else (target,):
+            for each in s.left.entries if isinstance(s.left, Several) else (s.left,):
                 if isinstance(each, Reference):
                     yield _name(each)
         elif isinstance(s, Branches):
@@ -216,10 +215,6 @@ def with_entries(names: Iterable[str], model: Class) -> list[str]:
 
 def _read_before(statement: Any) -> Iterator[str]:
     """The names in pre(…), edge(…) and change(…)."""
-    stack = [statement]
-    while stack:
-        e = stack.pop()
+    for e in each_part(statement):
         if isinstance(e, Call) and e.function in ("pre", "edge", "change") and isinstance(e.arguments[0], Reference):
             yield _name(e.arguments[0])
-        if isinstance(e, tuple):
-            stack.extend(e)

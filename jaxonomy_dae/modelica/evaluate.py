@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NoReturn
 
 import sympy
@@ -32,6 +32,7 @@ from .tree import (
     Truth,
     Unary,
     Whole,
+    entry_name,
 )
 from .values import Record, Results, Value, both, chosen, either, entrywise, is_condition, negated
 
@@ -115,6 +116,11 @@ class Evaluator:
         """The name of a variable that is declared by itself, an entry of an array among them."""
         return (self._entry_name(e, self.names) if any(e.subscripts) else None) or e.path
 
+    def entries_of(self, name: str, value: list) -> Iterator[tuple[str, Value]]:
+        """The entries of an array that are declared one by one: names and values."""
+        for place in self.entries.get(name, ()):
+            yield entry_name(name, place), functools.reduce(lambda entry, k: entry[k - 1], place, value)
+
     def _entry_name(self, e: Reference, names: Names) -> str | None:
         """The name of an entry that is declared by itself, as 'x[2].y'."""
         out = []
@@ -125,7 +131,7 @@ class Evaluator:
                 return None
             if len(numbers) != len(subscripts) or not all(isinstance(n, int) for n in numbers):
                 return None
-            out.append(f"{part}[{','.join(map(str, numbers))}]" if numbers else part)
+            out.append(entry_name(part, numbers) if numbers else part)
         return ".".join(out)
 
     def _entry(self, value: Value, subscripts: tuple[Expression, ...], names: Names) -> Value:

@@ -260,20 +260,14 @@ def _write_chain(scope: Scope, chain: list[tuple[list[Rise], tuple[Statement, ..
 
 def _before_tick(scope: Scope, parts: list[Expression]) -> list[Value]:
     """The conditions beside a clock, at its tick."""
-    scope.in_action = True
-    try:
+    with scope.at_event():
         return [v for v in (scope.evaluate(_inner(p)) for p in parts) if not isinstance(v, Sampled)]
-    finally:
-        scope.in_action = False
 
 
 def _pairs(scope: Scope, body: tuple[Statement, ...]) -> list[tuple[Any, Value]]:
     """Pairs (variable, new value) of all actions, as `_each_action` finds them, with the values before the event."""
-    scope.in_action = True
-    try:
+    with scope.at_event():
         return list(_each_action(scope, body))
-    finally:
-        scope.in_action = False
 
 
 def _actions(scope: Scope, body: tuple[Statement, ...], only_if: Value) -> list[Any]:
@@ -309,10 +303,9 @@ def _each_action(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Ta
             elif name == "terminate":
                 yield str(scope.evaluate(arguments[0])), None
         elif isinstance(s, Equality | Assignment):
-            target, value = (s.left, s.right) if isinstance(s, Equality) else (s.target, s.value)
-            several = isinstance(target, Several)
-            found = scope.interpreter.results(value) if several else scope.evaluate(value)
-            yield from _assigned(scope, target, found)
+            several = isinstance(s.left, Several)
+            found = scope.interpreter.results(s.right) if several else scope.evaluate(s.right)
+            yield from _assigned(scope, s.left, found)
         elif isinstance(s, Branches) and s.kind == "if":
             yield from _chosen_actions(scope, s)
         else:
@@ -347,11 +340,8 @@ def _assigned(scope: Scope, target: Expression, value: Value) -> Iterator[tuple[
         raise ModelError("in a when, a variable stands on the left")
     name = scope.interpreter.name_of(target)
     if isinstance(value, list):
-        for place in scope.entries.get(name, ()):
-            entry = value
-            for k in place:
-                entry = entry[k - 1]
-            yield DiscreteSymbol(f"{name}[{','.join(map(str, place))}]"), sympy.sympify(as_number(entry))
+        for each, entry in scope.interpreter.entries_of(name, value):
+            yield DiscreteSymbol(each), sympy.sympify(as_number(entry))
         return
     if name not in scope.definitions.stored:
         raise ModelError(f"'{name}' cannot be assigned in a when")

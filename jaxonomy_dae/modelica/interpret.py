@@ -124,6 +124,12 @@ class Interpreter(Evaluator):
 
     # --- statements --------------------------------------------------------------------------------------------------
 
+    def assigned_by(self, statements: tuple[Statement, ...], first: Mapping[str, Value] | None = None) -> dict:
+        """What an algorithm of the model assigns; `first` are values before it."""
+        local: dict[str, Value] = dict(first or {})
+        self.execute(statements, local, lambda name: local[name] if name in local else self.names(name))
+        return local
+
     def execute(self, statements: tuple[Statement, ...], local: dict[str, Value], names: Names) -> None:
         """Carries out an algorithm; assigns to `local`.
 
@@ -145,9 +151,8 @@ class Interpreter(Evaluator):
 
     def _statement(self, s: Statement, local: dict[str, Value], names: Names) -> None:
         if isinstance(s, Assignment | Equality):
-            target, value = (s.target, s.value) if isinstance(s, Assignment) else (s.left, s.right)
-            found = (self.results if isinstance(target, Several) else self.evaluate)(value, names)
-            self._assign(target, self._named(found), local, names)
+            found = (self.results if isinstance(s.left, Several) else self.evaluate)(s.right, names)
+            self._assign(s.left, self._named(found), local, names)
         elif isinstance(s, Branches):
             self._branches(s, local, names)
         elif isinstance(s, Loop):
@@ -183,14 +188,10 @@ class Interpreter(Evaluator):
 
     def _assign_whole(self, name: str, value: Value, local: dict[str, Value]) -> None:
         """Assigns to a variable; one by one to the entries of an array of the model, which are declared one by one."""
-        places = self.entries.get(name, ()) if name not in local and isinstance(value, list) else ()
-        if not places:
+        if name not in local and isinstance(value, list) and name in self.entries:
+            local.update(self.entries_of(name, value))
+        else:
             local[name] = value
-        for place in places:
-            entry = value
-            for k in place:
-                entry = entry[k - 1]
-            local[f"{name}[{','.join(map(str, place))}]"] = entry
 
     def _changed(self, old: Value, subscripts: tuple, parts: tuple, rest: tuple, value: Value, names: Names) -> Value:
         """An array or record with one place changed."""

@@ -28,6 +28,7 @@ from .tree import (
     Statement,
     Text,
     Truth,
+    entry_name,
 )
 
 SCHEMA = 43  # of the dictionary; rumoca changes it between its versions, and says nothing of the changes
@@ -102,7 +103,7 @@ class _Reader:
             value = self._entry(at["binding"], place) if at.get("binding") is not None else None
             if constant and value is None and "start" not in modifiers and modifiers.get("fixed") != Truth(False):
                 raise ModelError(f"{self.of.name}: the parameter '{v['name']}' has no value")
-            name = f"{v['name']}[{','.join(map(str, place))}]" if place else v["name"]
+            name = entry_name(v["name"], place) if place else v["name"]
             line = self.of.line(v.get("declaration"))
             comment = at.get("description") or ""
             yield Declaration(frozenset(prefixes), SCALAR[of["scalar"]], name, (), modifiers, value, comment, line)

@@ -162,7 +162,7 @@ class RumocaExpressions:
             field = self.types[self._record_type(inside["base"])]["record_fields"][inside["field"]]["name"]
             return Part(self.expression(inside["base"], places), field, ())
         if kind == "function_value":
-            return Reference((self._names(inside["function"])[inside["value"]],), ((),))
+            return Reference((self._names(inside["function"])[inside["value"]],))
         if kind == "call":
             _, owner, first, _ = self.nodes[inside["owner"]]
             arguments = self._arguments(owner, first, places)
@@ -193,7 +193,7 @@ class RumocaExpressions:
 
     def _coordinate(self, c: Any, subscripts: tuple[Expression, ...], places: Places, where: Json) -> Expression:
         if c == "time":
-            return Reference(("time",), ((),))
+            return Reference(("time",))
         if not isinstance(c, Mapping):
             self.refuse(f"'{c}'", where)
         kind, inside = next(iter(c.items()))
@@ -209,7 +209,7 @@ class RumocaExpressions:
             return Call("terminal", (), ())
         if kind == "binder":
             key = inside["domain"], inside["ordinal"]
-            return Number(places[key]) if key in places else Reference((_binder(*key),), ((),))
+            return Number(places[key]) if key in places else Reference((_binder(*key),))
         if kind == "function_parameter":
             name = self.functions[inside["function"]]["parameters"][inside["ordinal"]]["name"]
             return Reference((name,), (subscripts,))
@@ -304,9 +304,9 @@ class RumocaExpressions:
         elif kind == "assignment_group":  # all of them read what was before the first
             each = inside["assignments"]
             for k, a in enumerate(each):
-                yield Assignment(Reference((f":{k}",), ((),)), self.expression(a["rhs"], {}), line)
+                yield Assignment(Reference((f":{k}",)), self.expression(a["rhs"], {}), line)
             for k, a in enumerate(each):
-                yield Assignment(Reference((names[a["target"]],), ((),)), Reference((f":{k}",), ((),)), line)
+                yield Assignment(Reference((names[a["target"]],)), Reference((f":{k}",)), line)
         elif kind == "for":
             ranges = [
                 (_binder(*key), Range(Number(r.start), Number(r.step), Number(r.stop - 1)))
@@ -325,7 +325,7 @@ class RumocaExpressions:
             place = self._indexed({"base": inside["base"], "subscript_count": inside["subscript_count"]}, first, {})
             subscripts = place.subscripts if isinstance(place, Part) else ()
             return Assignment(Reference((target,), (subscripts,)), self.expression(inside["value"], {}), line)
-        return Assignment(Reference((target,), ((),)), self.expression(rhs, {}), line)
+        return Assignment(Reference((target,)), self.expression(rhs, {}), line)
 
     # --- places in the source ----------------------------------------------------------------------------------------
 

@@ -5,9 +5,10 @@ parameters are constants. Boolean, Integer and enumeration variables are of two 
 event are discrete variables; the others are expressions, put in wherever they are read.
 """
 
+import contextlib
 import functools
 import re
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import TypeVar
 
 import sympy
@@ -23,7 +24,7 @@ from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, LINEAR, SMOOTHNESS
-from .tree import Assignment, Branches, Declaration, Equality, Expression, Reference, Truth
+from .tree import Assignment, Branches, Declaration, Equality, Expression, Reference, Truth, entry_name
 from .values import Record, Value, as_number, both, is_condition, negated, plain
 
 REAL = "Real"
@@ -75,6 +76,15 @@ class Scope:
 
     def evaluate(self, e: Expression) -> Value:
         return self.interpreter.evaluate(e)
+
+    @contextlib.contextmanager
+    def at_event(self) -> Iterator[None]:
+        """Within it, values are evaluated that an event writes."""
+        self.in_action = True
+        try:
+            yield
+        finally:
+            self.in_action = False
 
     def is_discrete(self, name: str) -> bool:
         """True for variables that change at events only."""
@@ -144,7 +154,7 @@ class Scope:
             if len(inside[0]) > depth + 1:
                 out.append(self._array_of(name, inside, depth + 1))
             else:
-                out.append(self.value(f"{name}[{','.join(map(str, inside[0]))}]"))
+                out.append(self.value(entry_name(name, inside[0])))
         return out
 
     def _constant(self, d: Declaration) -> Value:
@@ -173,10 +183,7 @@ class Scope:
         for statements in self.flat.model.initial_algorithms:
             if name not in assigned_in(statements):
                 continue
-            local: dict[str, Value] = {}
-            self.interpreter.execute(
-                statements, local, lambda n, local=local: local[n] if n in local else self.value(n)
-            )
+            local = self.interpreter.assigned_by(statements)
             self.known.update(local)
             return local.get(name)
         return None
@@ -216,17 +223,8 @@ class Scope:
 
     def algorithm(self, number: int) -> dict[str, Value]:
         """What an algorithm assigns."""
-        statements = self.definitions.algorithms[number]
-        local: dict[str, Value] = {}
-        for name in self.definitions.assigned[number]:
-            if name in self.definitions.stored:
-                local[name] = self.stored(name)
-
-        def names(name: str) -> Value:
-            return local[name] if name in local else self.value(name)
-
-        self.interpreter.execute(statements, local, names)
-        return local
+        stored = {n: self.stored(n) for n in self.definitions.assigned[number] if n in self.definitions.stored}
+        return self.interpreter.assigned_by(self.definitions.algorithms[number], stored)
 
     # --- declarations ------------------------------------------------------------------------------------------------
 
@@ -259,10 +257,9 @@ class Scope:
         """The value that an initial equation gives to a parameter by itself; None if there is none."""
         for s in self.definitions.initial:
             if isinstance(s, Equality | Assignment):
-                target, value = (s.left, s.right) if isinstance(s, Equality) else (s.target, s.value)
-                if isinstance(target, Reference) and target.path == name and not any(target.subscripts):
+                if isinstance(s.left, Reference) and s.left.path == name and not any(s.left.subscripts):
                     try:
-                        return self.interpreter.evaluate(value, self._at_start)
+                        return self.interpreter.evaluate(s.right, self._at_start)
                     except ModelError:
                         return None
         return None
@@ -301,7 +298,7 @@ class Scope:
         if fixed and start is None:
             start = 0.0
         if d.value is not None:
-            self.definitions.equations.append(Equality(Reference((d.name,), ((),)), d.value, d.line))
+            self.definitions.equations.append(Equality(Reference((d.name,)), d.value, d.line))
         return self.component.variable(
             d.name, start=start, fixed=fixed, unit=self._unit(d),
             nominal=abs(nominal) if isinstance(nominal, int | float) and nominal else None,

@@ -3,8 +3,7 @@
 import dataclasses
 import graphlib
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import sympy
 
@@ -14,7 +13,7 @@ from ..modeling.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
 from .continuous import equal, pairs, side_by_side
 from .definitions import assigned_in, with_entries
 from .scope import Scope
-from .tree import Branches, Call, Equality, Reference, Statement
+from .tree import Branches, Call, Equality, Reference, Statement, each_part
 from .values import Value, as_number, is_condition
 
 
@@ -27,22 +26,13 @@ def in_order(scope: Scope, statements: Sequence[Statement]) -> list[Statement]:
             name = scope.interpreter.name_of(side) if isinstance(side, Reference) else ""
             if name in scope.definitions.stored:
                 given[name] = s
-    read = {name: set(with_entries(_names(s.right), scope.flat.model)) & given.keys() for name, s in given.items()}
+    names = {name: (e.path for e in each_part(s.right) if isinstance(e, Reference)) for name, s in given.items()}
+    read = {name: set(with_entries(found, scope.flat.model)) & given.keys() for name, found in names.items()}
     try:
         first = [given[name] for name in graphlib.TopologicalSorter(read).static_order()]
     except graphlib.CycleError:
         return list(statements)
     return [*first, *(s for s in statements if not any(s is f for f in first))]
-
-
-def _names(expression: Any) -> Iterator[str]:
-    stack = [expression]
-    while stack:
-        e = stack.pop()
-        if isinstance(e, Reference):
-            yield e.path
-        if isinstance(e, tuple):
-            stack.extend(e)
 
 
 def write_initial_equation(scope: Scope, s: Statement) -> None:
@@ -68,8 +58,7 @@ def write_initial_equation(scope: Scope, s: Statement) -> None:
 
 def write_initial_algorithm(scope: Scope, statements: tuple[Statement, ...]) -> None:
     """Adds what an algorithm has assigned at its end: a value that it assigns first and replaces later is none."""
-    local: dict[str, Value] = {}
-    scope.interpreter.execute(statements, local, lambda n: local[n] if n in local else scope.value(n))
+    local = scope.interpreter.assigned_by(statements)
     for name in with_entries(assigned_in(statements), scope.flat.model):
         for left, right in pairs(scope.value(name), local[name]):
             _hold_initially(scope, left, right)

@@ -4,6 +4,7 @@ Named tuples, since a model of a megabyte has a few hundred thousand nodes and t
 dataclasses.
 """
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -30,7 +31,7 @@ class Reference(NamedTuple):
     """A component reference: `parts` are its names, `subscripts` those of each part."""
 
     parts: tuple[str, ...]
-    subscripts: tuple[tuple["Expression", ...], ...]
+    subscripts: tuple[tuple["Expression", ...], ...] = ((),)
 
     @property
     def path(self) -> str:
@@ -136,10 +137,10 @@ class Equality(NamedTuple):
 
 
 class Assignment(NamedTuple):
-    """`target := value` in an algorithm."""
+    """`left := right` in an algorithm."""
 
-    target: Expression
-    value: Expression
+    left: Expression
+    right: Expression
     line: int
 
 
@@ -226,3 +227,20 @@ class Class(NamedTuple):
     def made_of(self) -> str | None:
         """The name of the type that a type stands for or extends."""
         return self.alias.type if self.alias else self.bases[0][0] if self.bases else None
+
+
+def each_part(tree: object) -> Iterator[Any]:
+    """All parts of a tree, itself among them."""
+    stack = [tree]
+    while stack:
+        part = stack.pop()
+        yield part
+        if isinstance(part, tuple):
+            stack.extend(part)
+        elif isinstance(part, dict):
+            stack.extend(part.values())
+
+
+def entry_name(name: str, place: Iterable[object]) -> str:
+    """The name of an entry of an array, as x[1,2]."""
+    return f"{name}[{','.join(map(str, place))}]"
