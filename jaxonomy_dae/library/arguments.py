@@ -1,6 +1,6 @@
-"""Checks of arguments that are no parameters: rows of numbers, counts, values in order.
+"""Checks of arguments that are no parameters: rows of numbers, counts, values in order; starts that may be left out.
 
-Each raises a `ModelError` that names the component and the argument.
+Each check raises a `ModelError` that names the component and the argument.
 """
 
 from collections.abc import Sequence
@@ -97,3 +97,11 @@ def yes_or_no(value: Any, name: str, what: str) -> int:
     if value not in (True, False):
         raise ModelError(f"'{name}': {what} is True or False; got {value!r}")
     return int(value)
+
+
+def start_of(
+    component: Component, name: str, given: Value | None, unit: str = "", guess: Value = 0.0
+) -> dict[str, Any]:
+    """Options of a variable that starts at the parameter `name`: at the given value, or else near a guess."""
+    start = component.parameter(name, guess if given is None else given, unit=unit)
+    return dict(start=start, fixed=given is not None, unit=unit)

@@ -15,19 +15,7 @@ import sympy
 from sympy import Max, exp
 
 from ..errors import ModelError
-from ..modeling import (
-    NONNEGATIVE,
-    POSITIVE,
-    Component,
-    Electrical,
-    Eq,
-    EqnEnv,
-    Interval,
-    Thermal,
-    Value,
-    der,
-    smooth,
-)
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Interval, Thermal, Value, der, smooth
 from ..modeling.arrays import ComponentArray
 from .arguments import count, increasing, row
 from .electrical.two_pin import TwoPin

@@ -161,10 +161,7 @@ class OneWayClutch(_Pressed):
         slipping = self.variable("slipping", unit="N*m")
         locked = self.discrete("locked", start=0, unit="1")
         self.add_equations(
-            Eq(w, der(b.phi - a.phi)),
-            Eq(b.tau, -tau),
-            Eq(a.tau + b.tau, 0),
-            Eq(slipping, most * smooth(Max(u, 0))),
+            Eq(w, der(b.phi - a.phi)), Eq(b.tau, -tau), Eq(a.tau + b.tau, 0), Eq(slipping, most * smooth(Max(u, 0)))
         )
         self.either(Eq(locked, 1), w, tau + slipping, order=1)
         self.when(w <= 0, assign(locked, 1), on=Eq(locked, 0), at_start=True)

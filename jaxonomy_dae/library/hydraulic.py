@@ -25,7 +25,7 @@ from ..modeling import (
     assign,
     der,
 )
-from .arguments import in_order
+from .arguments import in_order, start_of
 
 DENSITY = 998.2  # kg/m³, water at 20 °C
 VISCOSITY = 1.002e-3  # Pa·s, water at 20 °C
@@ -78,15 +78,14 @@ class Tank(Component):
     ):
         super().__init__(ev, name)
         area = self.parameter("A", A, unit="m2", bounds=POSITIVE)
-        level0 = self.parameter("initial_level", 1.0 if initial_level is None else initial_level, unit="m")
+        start = start_of(self, "initial_level", initial_level, "m", 1.0)
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         ambient = self.parameter("p_ambient", p_ambient, unit="Pa")
         gravity = self.parameter("g", g, unit="m/s2")
         fluid = self.port("fluid", Hydraulic)
-        level = self.variable("level", start=level0, fixed=initial_level is not None, unit="m")
+        level = self.variable("level", **start)
         self.add_equations(
-            Eq(density * area * der(level), fluid.m_flow),
-            Eq(fluid.p, ambient + density * gravity * level),
+            Eq(density * area * der(level), fluid.m_flow), Eq(fluid.p, ambient + density * gravity * level)
         )
         self.declare_energy(area * level * ambient, density * gravity * area * level**2 / 2)
 
@@ -103,11 +102,10 @@ class HydraulicCapacity(Component):
     ):
         super().__init__(ev, name)
         compliance = self.parameter("C", C, unit="m3/Pa", bounds=POSITIVE)
-        start = ATMOSPHERE if initial_pressure is None else initial_pressure
-        p0 = self.parameter("initial_pressure", start, unit="Pa")
+        start = start_of(self, "initial_pressure", initial_pressure, "Pa", ATMOSPHERE)
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         fluid = self.port("fluid", Hydraulic)
-        p = self.variable("p", start=p0, fixed=initial_pressure is not None, nominal=1e5, unit="Pa")
+        p = self.variable("p", nominal=1e5, **start)
         self.add_equations(Eq(p, fluid.p), Eq(density * compliance * der(p), fluid.m_flow))
         self.declare_energy(compliance * p**2 / 2)
 
@@ -136,10 +134,10 @@ class Accumulator(Component):
         total = self.parameter("V0", V0, unit="m3", bounds=POSITIVE)
         precharge = self.parameter("p0", p0, unit="Pa", bounds=POSITIVE)
         exponent = self.parameter("n", n, unit="1", bounds=POSITIVE)
-        start = self.parameter("initial_volume", initial_volume or 0.0, unit="m3")
+        start = start_of(self, "initial_volume", initial_volume, "m3")
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         fluid = self.port("fluid", Hydraulic)
-        volume = self.variable("V_fluid", start=start, fixed=initial_volume is not None, nominal=1e-3, unit="m3")
+        volume = self.variable("V_fluid", nominal=1e-3, **start)
         gas = self.variable("V_gas", nominal=1e-3, unit="m3", bounds=POSITIVE)
         self.add_equations(
             Eq(density * der(volume), fluid.m_flow),
@@ -163,7 +161,7 @@ class _TwoPort(Component):
     def _two_ports(self, m_flow: dict | None = None) -> tuple[sympy.Symbol, sympy.Symbol]:
         a, b = self.port("port_a", Hydraulic), self.port("port_b", Hydraulic)
         dp = self.variable("dp", nominal=1e5, unit="Pa")
-        flow = self.variable("m_flow", unit="kg/s", **(m_flow or {}))
+        flow = self.variable("m_flow", **(m_flow or {"unit": "kg/s"}))
         self.add_equations(Eq(dp, a.p - b.p), Eq(a.m_flow, flow), Eq(a.m_flow + b.m_flow, 0))
         return dp, flow
 
@@ -198,39 +196,27 @@ class Orifice(_Restriction):
     """
 
     def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        A: Value = 1e-4,
-        Cd: Value = 0.6,
-        rho: Value = DENSITY,
-        dp_small: Value = 100.0,
+        self, ev: EqnEnv, name: str, A: Value = 1e-4, Cd: Value = 0.6, rho: Value = DENSITY, dp_small: Value = 100.0
     ):
         super().__init__(ev, name)
+        opening = self._opening()
         through, flow = self._through(A, Cd, rho, dp_small)
-        self.add_equations(Eq(flow, through))
+        self.add_equations(Eq(flow, opening * through))
+
+    def _opening(self) -> Value:
+        """The open part of the area."""
+        return 1
 
 
-class Valve(_Restriction):
+class Valve(Orifice):
     """An `Orifice` whose area is `opening`·`A`: m_flow = opening·A·Cd·√(2·rho)·dp/(dp² + dp_small²)^(1/4).
 
     The input `opening` is 1 (open) unless `simulate` or a connected signal gives it; 0 is closed, and values outside
     [0, 1] are not cut off.
     """
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        A: Value = 1e-4,
-        Cd: Value = 0.6,
-        rho: Value = DENSITY,
-        dp_small: Value = 100.0,
-    ):
-        super().__init__(ev, name)
-        opening = self.input("opening", default=1.0, unit="1")
-        through, flow = self._through(A, Cd, rho, dp_small)
-        self.add_equations(Eq(flow, opening * through))
+    def _opening(self) -> Value:
+        return self.input("opening", default=1.0, unit="1")
 
 
 class CheckValve(_TwoPort):
@@ -287,13 +273,7 @@ class LaminarPipe(_TwoPort):
     """
 
     def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        D: Value = 0.01,
-        L: Value = 1.0,
-        rho: Value = DENSITY,
-        mu: Value = VISCOSITY,
+        self, ev: EqnEnv, name: str, D: Value = 0.01, L: Value = 1.0, rho: Value = DENSITY, mu: Value = VISCOSITY
     ):
         super().__init__(ev, name)
         diameter = self.parameter("D", D, unit="m", bounds=POSITIVE)
@@ -358,8 +338,7 @@ class Inertance(_TwoPort):
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         length = self.parameter("L", L, unit="m", bounds=POSITIVE)
         area = self.parameter("A", A, unit="m2", bounds=POSITIVE)
-        start = self.parameter("initial_m_flow", initial_m_flow or 0.0, unit="kg/s")
-        dp, flow = self._two_ports(m_flow=dict(start=start, fixed=initial_m_flow is not None))
+        dp, flow = self._two_ports(m_flow=start_of(self, "initial_m_flow", initial_m_flow, "kg/s"))
         self.add_equations(Eq(length / area * der(flow), dp))
         self.declare_energy(length / area * flow**2 / (2 * density))
 
@@ -397,14 +376,7 @@ class Cylinder(Component):
     are not stops. Source: Merritt (1967), the chapter on hydraulic power elements.
     """
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        A: Value = 1e-3,
-        rho: Value = DENSITY,
-        p_ambient: Value = ATMOSPHERE,
-    ):
+    def __init__(self, ev: EqnEnv, name: str, A: Value = 1e-3, rho: Value = DENSITY, p_ambient: Value = ATMOSPHERE):
         super().__init__(ev, name)
         area = self.parameter("A", A, unit="m2", bounds=POSITIVE)
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)

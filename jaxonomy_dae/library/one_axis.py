@@ -123,15 +123,7 @@ class Damper(Compliant):
 
 
 class Backlash(Compliant):
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        gap: Value = 0.01,
-        c: Value = 1e4,
-        d: Value = 10.0,
-        smooth: Value = 1e-4,
-    ):
+    def __init__(self, ev: EqnEnv, name: str, gap: Value = 0.01, c: Value = 1e4, d: Value = 10.0, smooth: Value = 1e-4):
         super().__init__(ev, name)
         play = self.parameter("gap", gap, unit=self.axis.position_unit, bounds=NONNEGATIVE)
         stiffness = self.parameter("c", c, unit=self.axis.stiffness_unit, bounds=NONNEGATIVE)

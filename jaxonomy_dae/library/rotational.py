@@ -6,6 +6,7 @@ flange, so an inertia obeys J·dw/dt = flange_a.tau + flange_b.tau.
 
 from ..modeling import POSITIVE, Component, Eq, EqnEnv, Rotational, Value, der
 from . import one_axis
+from .arguments import start_of
 from .one_axis import AboutAxis
 
 
@@ -30,11 +31,9 @@ class Inertia(Component):
     ):
         super().__init__(ev, name)
         inertia = self.parameter("J", J, unit="kg*m2", bounds=POSITIVE)
-        phi0 = self.parameter("initial_angle", initial_angle or 0.0, unit="rad")
-        w0 = self.parameter("initial_speed", initial_speed or 0.0, unit="rad/s")
         a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
-        phi = self.variable("phi", start=phi0, fixed=initial_angle is not None, unit="rad")
-        w = self.variable("w", start=w0, fixed=initial_speed is not None, unit="rad/s")
+        phi = self.variable("phi", **start_of(self, "initial_angle", initial_angle, "rad"))
+        w = self.variable("w", **start_of(self, "initial_speed", initial_speed, "rad/s"))
         acceleration = self.variable("a", unit="rad/s2")
         self.add_equations(
             Eq(phi, a.phi),

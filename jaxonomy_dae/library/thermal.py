@@ -14,7 +14,7 @@ import sympy
 
 from ..errors import ModelError
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Thermal, Value, der, smooth
-from .arguments import row
+from .arguments import row, start_of
 
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m²·K⁴), CODATA 2018
 
@@ -28,10 +28,9 @@ class HeatCapacitor(Component):
     def __init__(self, ev: EqnEnv, name: str, C: Value = 1.0, initial_temperature: Value | None = None):
         super().__init__(ev, name)
         capacity = self.parameter("C", C, unit="J/K", bounds=POSITIVE)
-        start = 293.15 if initial_temperature is None else initial_temperature
-        t0 = self.parameter("initial_temperature", start, unit="K")
         heat = self.port("heat", Thermal)
-        temperature = self.variable("T", start=t0, fixed=initial_temperature is not None, nominal=300.0, unit="K")
+        start = start_of(self, "initial_temperature", initial_temperature, "K", 293.15)
+        temperature = self.variable("T", nominal=300.0, **start)
         self.add_equations(Eq(temperature, heat.T), Eq(capacity * der(temperature), heat.Q_flow))
         self.declare_energy(capacity * temperature)
 

@@ -8,6 +8,7 @@ from sympy import Piecewise
 
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, Value, assign, der
 from . import one_axis
+from .arguments import start_of
 from .one_axis import AlongLine
 
 
@@ -32,11 +33,9 @@ class Mass(Component):
     ):
         super().__init__(ev, name)
         m = self.parameter("m", m, unit="kg", bounds=POSITIVE)
-        s0 = self.parameter("initial_position", initial_position or 0.0, unit="m")
-        v0 = self.parameter("initial_velocity", initial_velocity or 0.0, unit="m/s")
         flange = self.port("flange", Translational)
-        s = self.variable("s", start=s0, fixed=initial_position is not None, unit="m")
-        v = self.variable("v", start=v0, fixed=initial_velocity is not None, unit="m/s")
+        s = self.variable("s", **start_of(self, "initial_position", initial_position, "m"))
+        v = self.variable("v", **start_of(self, "initial_velocity", initial_velocity, "m/s"))
         self.add_equations(Eq(s, flange.s), Eq(der(s), v), Eq(m * der(v), flange.f))
         self.declare_energy(m * v**2 / 2)
 

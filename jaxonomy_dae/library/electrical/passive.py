@@ -3,6 +3,7 @@
 from sympy import Min, exp
 
 from ...modeling import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Thermal, Value, der, smooth
+from ..arguments import start_of
 from .two_pin import TwoPin, TwoPorts
 
 
@@ -42,8 +43,7 @@ class Capacitor(TwoPin):
     def __init__(self, ev: EqnEnv, name: str, C: Value = 1.0, initial_voltage: Value | None = None):
         super().__init__(ev, name)
         c = self.parameter("C", C, unit="F", bounds=POSITIVE)
-        v0 = self.parameter("initial_voltage", initial_voltage or 0.0, unit="V")
-        voltage, current = self._two_pins(v=dict(start=v0, fixed=initial_voltage is not None))
+        voltage, current = self._two_pins(v=start_of(self, "initial_voltage", initial_voltage, "V"))
         self.add_equations(Eq(c * der(voltage), current))
         self.declare_energy(c * voltage**2 / 2)
 
@@ -54,8 +54,7 @@ class Inductor(TwoPin):
     def __init__(self, ev: EqnEnv, name: str, L: Value = 1.0, initial_current: Value | None = None):
         super().__init__(ev, name)
         inductance = self.parameter("L", L, unit="H", bounds=POSITIVE)
-        i0 = self.parameter("initial_current", initial_current or 0.0, unit="A")
-        voltage, current = self._two_pins(i=dict(start=i0, fixed=initial_current is not None))
+        voltage, current = self._two_pins(i=start_of(self, "initial_current", initial_current, "A"))
         self.add_equations(Eq(inductance * der(current), voltage))
         self.declare_energy(inductance * current**2 / 2)
 
@@ -81,15 +80,10 @@ class MutualInductor(TwoPorts):
         first = self.parameter("L1", L1, unit="H", bounds=POSITIVE)
         second = self.parameter("L2", L2, unit="H", bounds=POSITIVE)
         mutual = self.parameter("M", M, unit="H")
-        starts = {}
-        for k, given in ((1, initial_current1), (2, initial_current2)):
-            start = self.parameter(f"initial_current{k}", given or 0.0, unit="A")
-            starts[f"i{k}"] = dict(start=start, fixed=given is not None)
+        given = ("1", initial_current1), ("2", initial_current2)
+        starts = {f"i{k}": start_of(self, f"initial_current{k}", start, "A") for k, start in given}
         v1, i1, v2, i2 = self._two_ports(**starts)
-        self.add_equations(
-            Eq(v1, first * der(i1) + mutual * der(i2)),
-            Eq(v2, mutual * der(i1) + second * der(i2)),
-        )
+        self.add_equations(Eq(v1, first * der(i1) + mutual * der(i2)), Eq(v2, mutual * der(i1) + second * der(i2)))
         self.declare_energy(first * i1**2 / 2, mutual * i1 * i2, second * i2**2 / 2)
 
 
@@ -121,13 +115,7 @@ class Memristor(TwoPin):
     """
 
     def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        Ron: Value = 100.0,
-        Roff: Value = 16e3,
-        k: Value = 1e4,
-        initial_w: Value = 0.1,
+        self, ev: EqnEnv, name: str, Ron: Value = 100.0, Roff: Value = 16e3, k: Value = 1e4, initial_w: Value = 0.1
     ):
         super().__init__(ev, name)
         on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)

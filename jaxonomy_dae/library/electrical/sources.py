@@ -1,62 +1,14 @@
 """Sources of voltage and current: constant, of time, of a signal, controlled."""
 
-from typing import ClassVar
-
 import sympy
 
 from ...modeling import Eq, EqnEnv, Value
-from ..laws import pulse, sine, step
+from .. import waveforms
 from .two_pin import TwoPin, TwoPorts
 
 
-class VoltageSource(TwoPin):
-    """An ideal source: the voltage is the parameter `V` (volt), whatever the current."""
-
-    def __init__(self, ev: EqnEnv, name: str, V: Value = 1.0):
-        super().__init__(ev, name)
-        V = self.parameter("V", V, unit="V")
-        voltage, current = self._two_pins()
-        self.add_equations(Eq(voltage, V))
-        self.declare_supply(-voltage * current)
-
-
-class CurrentSource(TwoPin):
-    """An ideal source: the current from `p` to `n` through it is the parameter `I` (ampere), whatever the voltage."""
-
-    def __init__(self, ev: EqnEnv, name: str, I: Value = 1.0):  # noqa: E741
-        super().__init__(ev, name)
-        source = self.parameter("I", I, unit="A")
-        voltage, current = self._two_pins()
-        self.add_equations(Eq(current, source))
-        self.declare_supply(-voltage * current)
-
-
-class SignalVoltage(TwoPin):
-    """An ideal source: the voltage is the input `u` (volt)."""
-
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        u = self.input("u", unit="V")
-        voltage, current = self._two_pins()
-        self.add_equations(Eq(voltage, u))
-        self.declare_supply(-voltage * current)
-
-
-class SignalCurrent(TwoPin):
-    """An ideal source: the current from `p` to `n` through it is the input `u` (ampere)."""
-
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        u = self.input("u", unit="A")
-        voltage, current = self._two_pins()
-        self.add_equations(Eq(current, u))
-        self.declare_supply(-voltage * current)
-
-
-class _OfTime(TwoPin):
-    """A source whose voltage or current, as `unit` says, is an expression in time."""
-
-    unit: ClassVar[str]
+class _Source(TwoPin, waveforms.Driven):
+    """A source whose voltage or current, as `unit` says, is an expression."""
 
     def _drive(self, value: sympy.Expr) -> None:
         voltage, current = self._two_pins()
@@ -64,77 +16,70 @@ class _OfTime(TwoPin):
         self.declare_supply(-voltage * current)
 
 
-class _Sine(_OfTime):
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        amplitude: Value = 1.0,
-        frequency: Value = 1.0,
-        phase: Value = 0.0,
-        offset: Value = 0.0,
-    ):
+class _Voltage(_Source):
+    unit = "V"
+
+
+class _Current(_Source):
+    unit = "A"
+
+
+class VoltageSource(_Voltage):
+    """An ideal source: the voltage is the parameter `V` (volt), whatever the current."""
+
+    def __init__(self, ev: EqnEnv, name: str, V: Value = 1.0):
         super().__init__(ev, name)
-        self._drive(sine(self, amplitude, frequency, phase, offset, self.unit))
+        self._drive(self.parameter("V", V, unit="V"))
 
 
-class _Step(_OfTime):
-    def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
+class CurrentSource(_Current):
+    """An ideal source: the current from `p` to `n` through it is the parameter `I` (ampere), whatever the voltage."""
+
+    def __init__(self, ev: EqnEnv, name: str, I: Value = 1.0):  # noqa: E741
         super().__init__(ev, name)
-        self._drive(step(self, height, start_time, offset, self.unit))
+        self._drive(self.parameter("I", I, unit="A"))
 
 
-class _Pulse(_OfTime):
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        height: Value = 1.0,
-        period: Value = 1.0,
-        width: Value = 0.5,
-        start_time: Value = 0.0,
-        offset: Value = 0.0,
-    ):
+class SignalVoltage(_Voltage):
+    """An ideal source: the voltage is the input `u` (volt)."""
+
+    def __init__(self, ev: EqnEnv, name: str):
         super().__init__(ev, name)
-        self._drive(pulse(self, height, period, width, start_time, offset, self.unit))
+        self._drive(self.input("u", unit="V"))
 
 
-class SineVoltage(_Sine):
+class SignalCurrent(_Current):
+    """An ideal source: the current from `p` to `n` through it is the input `u` (ampere)."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        self._drive(self.input("u", unit="A"))
+
+
+class SineVoltage(_Voltage, waveforms.Sine):
     """v = offset + amplitude·sin(2π·frequency·t + phase), in volt, hertz and radian."""
 
-    unit = "V"
 
-
-class SineCurrent(_Sine):
+class SineCurrent(_Current, waveforms.Sine):
     """i = offset + amplitude·sin(2π·frequency·t + phase), in ampere, hertz and radian."""
 
-    unit = "A"
 
-
-class StepVoltage(_Step):
+class StepVoltage(_Voltage, waveforms.Step):
     """v = offset, and offset + height from `start_time` (second) on, in volt. The step is an event."""
 
-    unit = "V"
 
-
-class StepCurrent(_Step):
+class StepCurrent(_Current, waveforms.Step):
     """i = offset, and offset + height from `start_time` (second) on, in ampere. The step is an event."""
 
-    unit = "A"
 
-
-class PulseVoltage(_Pulse):
+class PulseVoltage(_Voltage, waveforms.Pulse):
     """v = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
     offset, in volt. Its edges are events."""
 
-    unit = "V"
 
-
-class PulseCurrent(_Pulse):
+class PulseCurrent(_Current, waveforms.Pulse):
     """i = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
     offset, in ampere. Its edges are events."""
-
-    unit = "A"
 
 
 class VoltageControlledVoltage(TwoPorts):

@@ -14,8 +14,8 @@ class TwoPin(Component):
 
     def _two_pins(self, v: dict | None = None, i: dict | None = None) -> tuple[sympy.Symbol, sympy.Symbol]:
         p, n = self.port("p", Electrical), self.port("n", Electrical)
-        voltage = self.variable("v", unit="V", **(v or {}))
-        current = self.variable("i", unit="A", **(i or {}))
+        voltage = self.variable("v", **(v or {"unit": "V"}))
+        current = self.variable("i", **(i or {"unit": "A"}))
         self.add_equations(Eq(voltage, p.v - n.v), Eq(current, p.i), Eq(p.i + n.i, 0))
         return voltage, current
 
@@ -28,8 +28,8 @@ class TwoPorts(Component):
         symbols = []
         for k in (1, 2):
             p, n = self.port(f"p{k}", Electrical), self.port(f"n{k}", Electrical)
-            v = self.variable(f"v{k}", unit="V", **declared.get(f"v{k}", {}))
-            i = self.variable(f"i{k}", unit="A", **declared.get(f"i{k}", {}))
+            v = self.variable(f"v{k}", **declared.get(f"v{k}", {"unit": "V"}))
+            i = self.variable(f"i{k}", **declared.get(f"i{k}", {"unit": "A"}))
             self.add_equations(Eq(v, p.v - n.v), Eq(i, p.i), Eq(p.i + n.i, 0))
             symbols += [v, i]
         v1, i1, v2, i2 = symbols

@@ -5,6 +5,7 @@ from sympy import cos, sin
 
 from ...modeling import Component, Eq, EqnEnv, Planar, Rotational, Translational, Value, der
 from ...modeling.ports import Port
+from ..arguments import start_of
 
 
 class TwoFrames(Component):
@@ -47,12 +48,10 @@ class Revolute(TwoFrames):
         guess_angle: Value = 0.0,
     ):
         super().__init__(ev, name)
-        phi0 = self.parameter("initial_angle", guess_angle if initial_angle is None else initial_angle, unit="rad")
-        omega0 = self.parameter("initial_speed", 0.0 if initial_speed is None else initial_speed, unit="rad/s")
         a, b = self._two_frames()
         flange = self.port("flange", Rotational)
-        phi = self.variable("phi", start=phi0, fixed=initial_angle is not None, unit="rad")
-        omega = self.variable("omega", start=omega0, fixed=initial_speed is not None, unit="rad/s")
+        phi = self.variable("phi", **start_of(self, "initial_angle", initial_angle, "rad", guess_angle))
+        omega = self.variable("omega", **start_of(self, "initial_speed", initial_speed, "rad/s"))
         self.add_equations(
             Eq(b.x, a.x),
             Eq(b.y, a.y),
@@ -93,14 +92,10 @@ class Prismatic(TwoFrames):
     ):
         super().__init__(ev, name)
         inclination = self.parameter("angle", angle, unit="rad")
-        s0 = self.parameter(
-            "initial_position", guess_position if initial_position is None else initial_position, unit="m"
-        )
-        v0 = self.parameter("initial_velocity", 0.0 if initial_velocity is None else initial_velocity, unit="m/s")
         a, b = self._two_frames()
         flange = self.port("flange", Translational)
-        s = self.variable("s", start=s0, fixed=initial_position is not None, unit="m")
-        v = self.variable("v", start=v0, fixed=initial_velocity is not None, unit="m/s")
+        s = self.variable("s", **start_of(self, "initial_position", initial_position, "m", guess_position))
+        v = self.variable("v", **start_of(self, "initial_velocity", initial_velocity, "m/s"))
         along_x, along_y = cos(a.phi + inclination), sin(a.phi + inclination)
         self.add_equations(
             Eq(b.x, a.x + s * along_x),

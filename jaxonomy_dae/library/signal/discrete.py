@@ -136,11 +136,7 @@ class PulseWidth(Component):
         on, until = self.discrete("on", unit="1"), self.discrete("until", start=-1.0, unit="s")
         self.add_equations(Eq(y, amplitude * on))
         share = sympy.Min(sympy.Max(u, 0), 1)
-        self.when(
-            self.sampled(T),
-            assign(until, ev.t + T * share),
-            assign(on, sympy.Piecewise((1, u > 0), (0, True))),
-        )
+        self.when(self.sampled(T), assign(until, ev.t + T * share), assign(on, sympy.Piecewise((1, u > 0), (0, True))))
         self.when(ev.t >= until, assign(on, 0), on=Eq(on, 1))
 
 

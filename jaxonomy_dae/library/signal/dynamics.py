@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from ...errors import ModelError
 from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
-from ..arguments import count, finite, row
+from ..arguments import count, finite, row, start_of
 
 
 class Integrator(Component):
@@ -57,8 +57,7 @@ class DerivativeFilter(Component):
         super().__init__(ev, name)
         gain, lag = self.parameter("k", k), self.parameter("T", T, unit="s", bounds=POSITIVE)
         u = self.input("u")
-        x0 = self.parameter("initial_x", initial_x or 0.0)
-        x = self.variable("x", start=x0, fixed=initial_x is not None)
+        x = self.variable("x", **start_of(self, "initial_x", initial_x))
         y = self.variable("y", start=None if initial_x is not None else 0.0, fixed=initial_x is None)
         self.add_equations(Eq(y, gain * (u - x) / lag), Eq(lag * der(x), u - x))
 

@@ -3,11 +3,16 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from sympy import Max, Min
+from sympy import Expr, Max, Min
 
 from ...errors import ModelError
 from ...modeling import NONNEGATIVE, POSITIVE, Component, EqnEnv, Value
-from ..laws import pulse, sine, step
+from .. import waveforms
+
+
+class _Source(waveforms.Driven):
+    def _drive(self, value: Expr) -> None:
+        self.output("y", value)
 
 
 class Constant(Component):
@@ -18,12 +23,8 @@ class Constant(Component):
         self.output("y", self.parameter("k", k))
 
 
-class Step(Component):
+class Step(_Source, waveforms.Step):
     """y = offset, and offset + height from `start_time` (second) on. The step is an event."""
-
-    def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
-        super().__init__(ev, name)
-        self.output("y", step(self, height, start_time, offset, unit=""))
 
 
 class Ramp(Component):
@@ -45,38 +46,13 @@ class Ramp(Component):
         self.output("y", o + h * Min(Max((ev.t - t0) / length, 0), 1))
 
 
-class Sine(Component):
+class Sine(_Source, waveforms.Sine):
     """y = offset + amplitude·sin(2π·frequency·t + phase), in hertz and radian."""
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        amplitude: Value = 1.0,
-        frequency: Value = 1.0,
-        phase: Value = 0.0,
-        offset: Value = 0.0,
-    ):
-        super().__init__(ev, name)
-        self.output("y", sine(self, amplitude, frequency, phase, offset, unit=""))
 
-
-class Pulse(Component):
+class Pulse(_Source, waveforms.Pulse):
     """y = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
     offset. Its edges are events."""
-
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        height: Value = 1.0,
-        period: Value = 1.0,
-        width: Value = 0.5,
-        start_time: Value = 0.0,
-        offset: Value = 0.0,
-    ):
-        super().__init__(ev, name)
-        self.output("y", pulse(self, height, period, width, start_time, offset, unit=""))
 
 
 class Noise(Component):
