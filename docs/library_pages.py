@@ -39,7 +39,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "TransferFunction": {"numerator": [1.0], "denominator": [1.0, 1.0]},
 }
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-SHARED = {"one_axis"}  # modules of classes that domains share; a component needs a domain
+SHARED = {"one_axis", "waveforms"}  # modules of classes that domains share; a component needs a domain
 TITLE = "Library"
 WIDTH = 80  # letters in a line of code at 1280 px
 
