@@ -10,6 +10,7 @@ connected components of a graph. The others follow one by one.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,6 +24,7 @@ from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, VariableT
 from ..tolerances import EPS, NOISE
 
 DECADES = 30.0  # that factors span at most: single precision has 38
+COMPARED = 4  # terms of an equation that are compared with each other: sorting all terms of a large model takes longer
 SWEEPS = 8  # after which equations of any length are looked at one by one
 
 
@@ -137,23 +139,40 @@ def _terms_of(groups: Sequence[EquationGroup]) -> tuple[_Terms, int]:
 
 
 def _canonical(terms: _Terms, classes: _Classes) -> _Terms:
-    """The rows in roots, terms of equal quantity merged; what rounding leaves of terms that cancel is nothing."""
-    terms = terms.take(np.append(classes.root, ZERO)[terms.variable] != ZERO)
-    v = terms.variable
+    """The rows in roots, terms of equal quantity merged; what rounding leaves of terms that cancel is nothing. Terms
+    stay in the order they were written in."""
+    is_there = np.append(classes.root, ZERO)[terms.variable] != ZERO
+    terms = terms if is_there.all() else terms.take(is_there)
+    v, row = terms.variable, terms.row
     factor = classes.factor[v]
     coefficient = factor * terms.coefficient
     noise = np.abs(factor) * terms.noise + EPS * classes.products[v] * np.abs(coefficient)
     root, order = classes.root[v], terms.order + classes.order[v]
-    by = np.lexsort((order, root, terms.row))
-    row, root, order = terms.row[by], root[by], order[by]
-    new = np.ones(len(by), bool)
-    new[1:] = (np.diff(row) != 0) | (np.diff(root) != 0) | (np.diff(order) != 0)
-    first = np.flatnonzero(new)
-    if len(first):
-        coefficient, noise = np.add.reduceat(coefficient[by], first), np.add.reduceat(noise[by], first)
-    merged = _Terms(row[first], root[first], order[first], coefficient, noise)
-    in_place = np.argsort(by[first], kind="stable")  # terms stay in the order they were written in
-    return merged.take(in_place[(np.abs(coefficient) > noise)[in_place]])
+    kept = np.ones(len(row), bool)
+    some = np.flatnonzero(_may_repeat(row, root, order)[row])
+    if len(some):
+        by = some[np.lexsort((order[some], root[some], row[some]))]
+        new = np.ones(len(by), bool)
+        new[1:] = (np.diff(row[by]) != 0) | (np.diff(root[by]) != 0) | (np.diff(order[by]) != 0)
+        first = np.flatnonzero(new)
+        sums = np.add.reduceat(coefficient[by], first), np.add.reduceat(noise[by], first)
+        kept[some], kept[by[first]] = False, True
+        coefficient[by[first]], noise[by[first]] = sums
+    kept &= np.abs(coefficient) > noise
+    return _Terms(row, root, order, coefficient, noise).take(kept)
+
+
+def _may_repeat(row: np.ndarray, root: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """False for equations that certainly have no quantity twice, by their numbers."""
+    count = np.bincount(row)
+    start = np.cumsum(count) - count
+    repeats = count > COMPARED
+    for length in range(2, COMPARED + 1):
+        members = np.flatnonzero(count == length)
+        for i, j in itertools.combinations(range(length), 2):
+            a, b = start[members] + i, start[members] + j
+            repeats[members] |= (root[a] == root[b]) & (order[a] == order[b])
+    return repeats
 
 
 def _starts(terms: _Terms, n_rows: int) -> tuple[np.ndarray, np.ndarray]:
