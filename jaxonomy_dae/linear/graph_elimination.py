@@ -48,7 +48,7 @@ class GraphElimination:
 
     def __init__(self, matrix: Any):
         self._rounds: Sequence[_Round]
-        self._rounds, core = _rounds(sp.csr_array(matrix))
+        self._rounds, core = _rounds(with_small_indices(sp.csr_array(matrix)))
         self._core = None
         if core.shape[0]:
             options = {"SymmetricMode": True}
@@ -66,6 +66,15 @@ class GraphElimination:
         for one, own in zip(reversed(self._rounds), reversed(eliminated), strict=True):
             found = one.backwards(own, found)
         return found
+
+
+def with_small_indices(matrix: Any) -> Any:
+    """The matrix, compressed by rows, with 32-bit indices, where these are enough: products take two thirds of the
+    time and of the memory."""
+    if max(*matrix.shape, matrix.nnz) > np.iinfo(np.int32).max:
+        return matrix
+    places = matrix.indices.astype(np.int32, copy=False), matrix.indptr.astype(np.int32, copy=False)
+    return sp.csr_array((matrix.data, *places), shape=matrix.shape)
 
 
 def _rounds(matrix: Any) -> tuple[list[_Round], Any]:

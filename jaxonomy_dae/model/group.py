@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..aliases import Numeric
+from .linear_template import MANY, LinearTemplate
 from .opaque import Networks
 from .provenance import Provenances
 from .template import AbstractTemplate
@@ -110,12 +111,16 @@ class QuantityGroup(Group):
     @np.errstate(all="ignore")
     def residual(self, at: Point) -> Float[np.ndarray, " n"]:
         """The residuals."""
+        if isinstance(self.template, LinearTemplate) and self.factor.shape[1] > MANY:  # from the first term to the last
+            return np.cumsum(self.coefficient * (self.factor * at.values[self.quantity]), axis=1)[:, -1]
         out = self.template.residual(*self._arguments(at), backend="numpy")
         return np.broadcast_to(np.asarray(out, float), (len(self),))
 
     @np.errstate(all="ignore")
     def partials(self, at: Point) -> Float[np.ndarray, "n slots"]:
         """∂(residual)/∂(quantity), by slots."""
+        if isinstance(self.template, LinearTemplate):
+            return self.coefficient * self.factor
         out = self.template.partial_values(*self._arguments(at), backend="numpy")
         return self._stacked(out) * self.factor
 

@@ -1,5 +1,6 @@
 """Sizes of quantities and parameters at which all terms of all equations are alike, whatever the units."""
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -7,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from ..linear.graph_elimination import GraphElimination
+from ..linear.graph_elimination import GraphElimination, with_small_indices
 from .group import Point, QuantityGroup
 from .jacobian import generic
 from .tables import ZERO
@@ -87,6 +88,8 @@ def natural_sizes(
         matrix: Any = sp.vstack([s.powers(n, n_parameters, n_equations) for s in seen], format="csr")
         matrix.data[known[matrix.indices]] = 0.0
         off = np.concatenate([s.logarithm for s in seen])
+        is_last = all(s.is_linear(parameters != 0.0) for s in seen)
+        del entries, seen  # of a large model, as large as the factors
         if by_terms:
             moved = np.log10(np.abs(np.append(quantity, parameter))) - begun
             stay = sp.eye_array(len(moved), matrix.shape[1]) * RELUCTANCE
@@ -99,10 +102,7 @@ def natural_sizes(
         found = factors.least_squares(matrix, -off)
         time += float(found[-1]) if rates is not None else 0.0
         quantity, parameter = _moved(quantity, found[:n]), _moved(parameter, found[n : n + n_parameters])
-        if (
-            all(s.is_linear(parameters != 0.0) for s in seen)
-            or np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3
-        ):
+        if is_last or np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3:
             break
     return quantity, parameter
 
@@ -125,21 +125,20 @@ class Factors:
     parameters, other values of these change the right-hand side alone."""
 
     def __init__(self):
-        self._matrix: Any = None
+        self._digest = b""
         self._factors: GraphElimination
 
     def least_squares(self, matrix: Any, right: np.ndarray) -> np.ndarray:
         """The x of least norm with A·x near b, by normal equations: logarithms need a few digits, of which an iterative
         method takes as many steps as a chain has links."""
-        if self._matrix is None or not _are_equal(self._matrix, matrix):
-            normal = matrix.T @ matrix + DAMPING**2 * sp.eye_array(matrix.shape[1])
-            self._matrix, self._factors = matrix, GraphElimination(normal)
+        matrix = with_small_indices(matrix)
+        digest = hashlib.sha256(repr(matrix.shape).encode())
+        for part in (matrix.indptr, matrix.indices, matrix.data):
+            digest.update(part.data)
+        if digest.digest() != self._digest:  # the matrix itself would take as much memory as its factors
+            normal = matrix.T @ matrix + DAMPING**2 * sp.eye_array(matrix.shape[1], format="csr")
+            self._digest, self._factors = digest.digest(), GraphElimination(normal)
         return self._factors.solve(matrix.T @ right)
-
-
-def _are_equal(one: Any, other: Any) -> bool:
-    parts = ("indptr", "indices", "data")
-    return one.shape == other.shape and all(np.array_equal(getattr(one, p), getattr(other, p)) for p in parts)
 
 
 def _moved(size: np.ndarray, decades: np.ndarray) -> np.ndarray:
