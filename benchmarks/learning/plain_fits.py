@@ -98,6 +98,18 @@ def truth(plant, seconds):
     return ts, dict(zip(plant.starts, run.y, strict=True))
 
 
+def compared(fit, plant, states):
+    """(error of each law, its stated deviation, the share of the range inside the band)."""
+    found = {}
+    for law, u in plant.inputs(states).items():
+        grid = np.linspace(u.min(), u.max(), 60)
+        right, band = plant.laws[law](grid), fit.band(f"c.{law}", grid)
+        unit = np.sqrt(np.mean(right**2))
+        error, stated = (np.sqrt(np.mean(e**2)) / unit for e in (band.mean - right, band.spread))
+        found[law] = error, stated, np.mean((band.low <= right) & (right <= band.high))
+    return found
+
+
 def main(names, shapes, noises, seeds, seconds, factor):
     for name in names:
         plant = PLANTS[name]
@@ -124,12 +136,7 @@ def main(names, shapes, noises, seeds, seconds, factor):
                     start, drawn = time.process_time(), {f"c.{n}": net for n, net in nets(seed).items()}
                     there = eqx.tree_at(lambda s: s.neural, system, drawn)
                     fit = problem.beginning_at(there).fit(data, warn=False)
-                    for law, u in plant.inputs(states).items():
-                        grid = np.linspace(u.min(), u.max(), 60)
-                        right, band = plant.laws[law](grid), fit.band(f"c.{law}", grid)
-                        unit = np.sqrt(np.mean(right**2))
-                        error, stated = (np.sqrt(np.mean(e**2)) / unit for e in (band.mean - right, band.spread))
-                        covered = np.mean((band.low <= right) & (right <= band.high))
+                    for law, (error, stated, covered) in compared(fit, plant, states).items():
                         rows.append((error, stated, covered, fit.ok))
                         print(
                             f"{name} {shape} noise {noise} weights {seed} {law}: {100 * error:.2f} %, stated "

@@ -1,7 +1,6 @@
 """How well an estimate agrees with its data: errors by name, the likelihood, and whether residuals look like noise."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 import scipy.stats
@@ -11,7 +10,6 @@ from .descent import Minimum
 from .objective import Objective
 
 STRONGEST = 0.97  # correlation of neighbours: beyond, a record has too few independent parts for its covariance
-SHORTEST = 8  # frequencies of a record below which its lowest ones are those that a fit takes away
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +22,6 @@ class Whiteness:
         `lags` degrees of freedom.
     - `peak`: the probability that the spectrum of white noise has a peak as high as this one. A missing mode of the
         model makes such a peak.
-    - `spectrum`: the periodogram from the lowest frequency on, of mean one.
     - `period`: that of its highest peak, in samples.
     """
 
@@ -32,7 +29,6 @@ class Whiteness:
     statistic: float
     lags: int
     peak: float
-    spectrum: tuple[float, ...] = ()
     lag: int = 1
     strongest: float = np.nan
     period: float = np.nan
@@ -65,10 +61,9 @@ def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
     squares = np.abs(np.fft.rfft(centred)[1 : (n + 1) // 2]) ** 2
     rho = np.array([float(centred[k:] @ centred[:-k]) for k in range(1, lags + 1)]) / power
     statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-    spectrum = tuple((squares / squares.mean()).tolist())
     most, period = int(np.argmax(np.abs(rho))), n / (int(np.argmax(squares)) + 1)
     return Whiteness(
-        correlation=float(rho[0]), statistic=statistic, lags=lags, peak=peak(squares), spectrum=spectrum, lag=most + 1,
+        correlation=float(rho[0]), statistic=statistic, lags=lags, peak=peak(squares), lag=most + 1,
         strongest=float(rho[most]), period=period,
     )  # fmt: skip
 
@@ -80,22 +75,6 @@ def peak(squares: Float[np.ndarray, " m"]) -> float:
         return 1.0
     share = float(squares.max() / squares.sum())
     return min(len(squares) * (1 - share) ** (len(squares) - 1), 1.0)
-
-
-def slow(tests: Sequence[Whiteness]) -> float:
-    """The probability that white noise has as much power at its lowest frequencies, of all outputs and experiments
-    together: where a model errs, its errors are as slow as what it describes. 1, 2, 4, … frequencies are tried, up to a
-    quarter of them, each against χ² of two degrees of freedom for each frequency (a smooth test; Neyman 1937), with
-    Bonferroni's bound. A fit takes power from low frequencies, so that right models are doubted less often."""
-    spectra = [np.array(test.spectrum) for test in tests if len(test.spectrum) >= SHORTEST]
-    if not spectra:
-        return 1.0
-    counts = 2 ** np.arange(int(np.log2(max(map(len, spectra)) / 4)) + 1)
-    found = []
-    for count in counts:
-        chosen = [spectrum[: min(count, len(spectrum) // 4)] for spectrum in spectra]
-        found.append(scipy.stats.chi2.sf(2 * sum(map(np.sum, chosen)), 2 * sum(map(len, chosen))))
-    return min(float(min(found)) * len(counts), 1.0)
 
 
 def log_likelihood(m: Minimum) -> float:

@@ -1,23 +1,20 @@
 """Whether a fit can be relied on: what is against it, each with what to try next.
 
-A reason is given only where chance would give it to a right model once in a hundred fits.
+What a fit leaves over is judged by one test (`leftover.py`), which doubts a right model in two of a hundred fits.
 """
 
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.stats
 
 from ..diagnosis.wording import listed
-from .agreement import slow
+from .leftover import LEVEL, Leftover
 from .objective import AWAY
 
 if TYPE_CHECKING:
     from .estimate import Estimate
 
-# Probability below which noise is no excuse: with two such checks, right models are doubted in less than one of fifty
-# fits, as each bounds what chance does from above.
-IMPROBABLE = 1e-2
+SINGLE = 1e-2  # probability of a single test below which it is named, once all tests together doubt the model
 FAINT = 10.0  # times the integration's tolerance: residuals below are its error, which is never white
 BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
 
@@ -31,56 +28,70 @@ def reasons(fit: "Estimate") -> tuple[str, ...]:
     found = []
     if not fit.minimum.converged:
         found.append(f"{fit.message}: start elsewhere, with starts=5 or horizons=(0.1, 0.3, 1), or allow more steps=")
-    for check in (_chi2, _colour, _table):
+    for check in (_leftover, _table):
         found.extend(check(fit))
     return tuple(found)
 
 
-def _chi2(fit: "Estimate") -> list[str]:
-    """χ² of the samples whose noise level is known."""
-    m, known = fit.minimum, fit.objective.evidence.noise < 0
-    if not known.any() or fit.objective.has_variances:
+def _leftover(fit: "Estimate") -> list[str]:
+    """What is left over, if it is not noise: all tests that say so, at least the one that says it most clearly."""
+    s = fit.objective.stacked
+    pairs = [(label, name) for label, by in fit.residuals.items() for name in by if not _is_faint(fit, label, name)]
+    left = Leftover.of(fit, [(s.labels.index(label), s.outputs.index(name)) for label, name in pairs])
+    if left.probability > LEVEL:
         return []
-    count = float(np.sum(m.weights.share[known] ** 2))
-    chi2 = float(np.sum((m.weights.share * m.weights.scores(m.found.residual))[known] ** 2))
-    freedom = max(count * fit.freedom / m.weights.samples, 1.0)
-    if scipy.stats.chi2.sf(chi2, freedom) > IMPROBABLE:
-        return []
-    return [
-        f"χ² is {chi2:.4g} where noise of the given sigma makes it {freedom:.4g} ± {np.sqrt(2 * freedom):.2g}: the "
-        "model lacks something, the search ended in a local minimum (starts=5), or sigma is too small"
-    ]
-
-
-def _colour(fit: "Estimate") -> list[str]:
-    """Outputs whose residuals are correlated from sample to sample, over all experiments together (Ljung and Box's
-    statistics add up), or have a frequency that stands out; and what all outputs have in common: power at low
-    frequencies. Half of the probability of a false alarm goes to what they have in common."""
-    s, tests = fit.objective.stacked, {}
-    for label, by in fit.whiteness.items():
-        for name, test in by.items():
-            if test.statistic >= 0 and not _is_faint(fit, label, name):
-                tests.setdefault(name, []).append((label, test))
-    found = []
-    for name, each in tests.items():
-        together = scipy.stats.chi2.sf(sum(t.statistic for _, t in each), sum(t.lags for _, t in each))
-        alone = min(min(t.probability, t.peak) for _, t in each) * 2 * len(each)
-        if 4 * min(float(together), alone) * len(tests) < IMPROBABLE:
-            label, worst = min(each, key=lambda pair: min(pair[1].probability, pair[1].peak))
-            where = f" of {label}" if len(s.labels) > 1 else ""
-            found.append(f"'{name}'{where} ({worst.finding})")
-    every = [test for each in tests.values() for _, test in each]
-    if not found and 2 * slow(every) >= IMPROBABLE:
-        return []
-    if not found:
-        strongest = max(tests, key=lambda name: sum(sum(test.spectrum[:4]) for _, test in tests[name]))
-        found.append(
-            f"those of '{strongest}' and others drift slowly" if len(tests) > 1 else f"'{strongest}' drifts slowly"
+    named = {name for name, p in left.found.items() if p <= max(min(left.found.values()), SINGLE)}
+    said = []
+    if "χ²" in named:
+        chi2 = float(np.sum((left.share * left.scores)[left.known] ** 2))
+        said.append(
+            f"χ² is {chi2:.4g} where noise of the given sigma makes it {left.freedom:.4g} ± "
+            f"{np.sqrt(2 * left.freedom):.2g}: the model lacks something, the search ended in a local minimum "
+            "(starts=5), or sigma is too small"
         )
+    colours = [word for tests, words in COLOURS if named & tests for word in words(fit, left)]
+    if colours:
+        said.append(
+            f"residuals are not white noise: {', '.join(colours[:4])}. The model lacks something there, or noise is "
+            "correlated: intervals are too narrow, and those of fit.table(white=False) wider. Look at "
+            "fit.plot_residuals()"
+        )
+    return said
+
+
+def _standing_out(fit: "Estimate", left: Leftover) -> list[str]:
+    """The outputs whose neighbours correlate, or that have a frequency that stands out."""
+    s, by_name = fit.objective.stacked, {}
+    for one in left.series:
+        name = s.outputs[one.output]
+        test = fit.whiteness[s.labels[one.experiment]][name]
+        by_name.setdefault(name, []).append((min(test.probability, test.peak), s.labels[one.experiment], test))
+    worst = sorted((min(each, key=lambda row: row[0]), name) for name, each in by_name.items())
+    clear = [row for row in worst if row[0][0] * len(left.series) < SINGLE] or worst[:1]
     return [
-        f"residuals are not white noise: {', '.join(found[:4])}. The model lacks something there, or noise is "
-        "correlated: intervals are too narrow, and those of fit.table(white=False) wider. Look at fit.plot_residuals()"
+        f"'{name}'{f' of {label}' if len(s.labels) > 1 else ''} ({test.finding})" for (_, label, test), name in clear
     ]
+
+
+def _drifting(fit: "Estimate", left: Leftover) -> list[str]:
+    """The output that has the most power at low frequencies."""
+    name = fit.objective.stacked.outputs[left.slowest()]
+    several = len({one.output for one in left.series}) > 1
+    return [f"those of '{name}' and others drift slowly" if several else f"'{name}' drifts slowly"]
+
+
+def _following(fit: "Estimate", left: Leftover) -> list[str]:
+    """The output whose residuals follow a signal most clearly."""
+    output, signal = left.strongest_signal()
+    return [f"'{fit.objective.stacked.outputs[output]}' follows {signal}"]
+
+
+# Tests of `Leftover`, and what they say.
+COLOURS = (
+    ({"neighbours", "all neighbours", "peak", "common peak"}, _standing_out),
+    ({"slow"}, _drifting),
+    ({"signals"}, _following),
+)
 
 
 def _is_faint(fit: "Estimate", label: str, name: str) -> bool:

@@ -7,7 +7,7 @@ import scipy.stats
 
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.learning import Noise, Progress
-from jaxonomy_dae.learning.agreement import correlated, slow, whiteness
+from jaxonomy_dae.learning.agreement import correlated
 from jaxonomy_dae.learning.noise import Tails
 from jaxonomy_dae.learning.progress import Watch, reporter
 
@@ -52,20 +52,6 @@ def test_distributions_are_those_of_scipy(nu, k):
     w, pull = wide.bent(grid)[0], wide.pull(grid) * grid
     p = np.exp(-0.5 * w**2 + wide.log_peak()) / np.sqrt(2 * np.pi)
     np.testing.assert_allclose(np.sum(p * pull**2) * (grid[1] - grid[0]), tails.information()[0], rtol=1e-3)
-
-
-def test_slow_residuals_are_found_in_all_outputs_together():
-    """Small errors of a model showed in no output alone."""
-    rng = np.random.default_rng(0)
-    t, doubted, noticed, alone = np.linspace(0, 1, 100), 0, 0, 0
-    for _ in range(400):
-        white = [rng.standard_normal(100) for _ in range(3)]
-        doubted += slow([whiteness(r) for r in white]) < 0.01
-        wrong = [whiteness(r + 0.35 * np.sin(2 * np.pi * t + k)) for k, r in enumerate(white)]
-        noticed += slow(wrong) < 0.01
-        alone += min(min(w.probability, w.peak) for w in wrong) * 6 < 0.01
-    assert doubted <= 8 and noticed > 240 and noticed > 2 * alone
-    assert slow([whiteness(np.ones(5))]) == 1.0 and slow([]) == 1.0
 
 
 def test_intervals_hold_where_residuals_are_correlated():

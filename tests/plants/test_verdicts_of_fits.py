@@ -35,19 +35,21 @@ def truth(cubic=0.0):
 
 @pytest.mark.long("residuals and their Jacobian, and a hundred fits of 20 ms")
 def test_small_errors_of_a_model_are_noticed_and_right_models_are_not_doubted():
-    """What a wrong spring leaves of 0.3 σ, or a slow input of 0.3 σ, passed in three of four fits."""
+    """What a wrong spring leaves of 0.3 σ, or a slow input of 0.3 σ, passed in three of four fits, and a mode of half
+    the noise in two of five."""
     system, problem = compiled(Oscillator(EqnEnv())), None
 
     def share(records, count):
         nonlocal problem
         said = 0
         for seed in range(count):
-            x, v = records + NOISE * np.random.default_rng(seed).standard_normal((2, 200))
+            x, v = records + NOISE * np.random.default_rng([1, seed]).standard_normal((2, 200))
             data = learning.Experiment(TS, {"c.x": x, "c.v": v}, sigma={"c.x": 0.01, "c.v": 0.02})
             problem = problem or learning.Problem(system, data, train=["c.k", "c.d"])
             said += problem.fit(data, warn=False).ok
         return said / count
 
-    assert share(truth(), 80) >= 0.95
-    assert share(truth(0.072), 20) < 0.4  # k and d fitted, 0.3 σ are left
-    assert share(truth() + 0.42 * NOISE * np.sin(0.9 * TS + 1), 20) < 0.3
+    assert share(truth(), 100) >= 0.95
+    assert share(truth(0.072), 20) < 0.3  # k and d fitted, 0.3 σ are left
+    assert share(truth() + 0.42 * NOISE * np.sin(0.9 * TS + 1), 20) < 0.25
+    assert share(truth() + 0.5 * NOISE * np.sin(13.3 * TS + 1), 20) < 0.25

@@ -1,0 +1,260 @@
+"""Whether what a fit leaves over is noise: one test of one level, made of several that each look for another error.
+
+- χ² of the samples whose noise level is known: a model that misses more than the noise.
+- Correlations of neighbours, by the statistic of Ljung and Box (1978): noise that is correlated.
+- The highest peak of the periodogram (Fisher 1929), of one output and of all: a mode that the model lacks.
+- Power at the lowest 1, 2, 4, … frequencies (a smooth test; Neyman 1937): errors as slow as what the model describes.
+- Correlations with inputs, and with predictions, their rates, squares and drifts: wrong inputs, gains and delays.
+
+A fit takes from the noise what looks like a change of its numbers. With J the derivatives of predictions in units of
+the noise and C the covariance of the numbers, residuals of a right model have the covariance I − J C Jᵀ, where C
+contains the priors. Residuals drawn with this covariance say how often chance gives a least probability as small as the
+one that was found: a Monte Carlo test (Barnard 1963, J. R. Stat. Soc. B 25:294; Dufour 2006, J. Econometrics 133:443).
+So degrees of freedom that the fit has used up count, and tests that depend on each other are not counted twice.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import chdtrc
+
+if TYPE_CHECKING:
+    from .estimate import Estimate
+
+LEVEL = 0.02  # of right models, the share that is doubted: fewer than one in twenty, whatever other reasons add
+DRAWS = 499  # of residuals, so that this level is a whole number of them; a test with as many loses 2 % of its power
+BATCH = 50  # draws at once: most right models are known by the first
+ROOM = 2e7  # numbers at once: 160 MB
+FEWEST = 4  # samples of a series, below which there is nothing to correlate
+SHORTEST = 8  # frequencies of a record below which its lowest ones are those that a fit takes away
+FINE = 2  # frequencies for each that is independent: a peak between two of these loses up to three fifths of its power
+ALIKE = 1e-3  # of the greatest singular value: signals that differ by less are one
+
+
+class Series(NamedTuple):
+    """The samples of one output in one experiment, as positions among all."""
+
+    experiment: int
+    output: int
+    at: Int[np.ndarray, " n"]
+
+
+class Signals(NamedTuple):
+    """What residuals of one output may correlate with, over all experiments: `each` by name, of length one; the `basis`
+    of all; and how many of them a fit does not take up."""
+
+    at: Int[np.ndarray, " n"]
+    basis: Float[np.ndarray, "n k"]
+    count: float
+    names: tuple[str, ...]
+    each: Float[np.ndarray, "n s"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Leftover:
+    """Residuals in units of the noise, and what is needed to judge them.
+
+    - `share`: the root of each residual's weight.
+    - `leverage`: L, of which L Lᵀ is what the fit takes from the noise, weights included.
+    - `known`: True for samples whose noise level is known; `freedom`: of their χ².
+    """
+
+    scores: Float[np.ndarray, " m"]
+    share: Float[np.ndarray, " m"]
+    leverage: Float[np.ndarray, "m r"]
+    series: tuple[Series, ...]
+    signals: tuple[Signals, ...]
+    known: np.ndarray
+    freedom: float
+
+    @classmethod
+    def of(cls, fit: "Estimate", counts: Iterable[tuple[int, int]]) -> "Leftover":
+        """Those of a fit. `counts`: (experiment, output) of the series whose form is judged."""
+        m, o = fit.minimum, fit.objective
+        experiment, _, output = o.rows
+        share = m.weights.share
+        leverage = m.weights.informing[:, None] * m.found.jacobian @ fit.root[o.free]
+        known = o.evidence.noise < 0 if not o.has_variances else np.zeros(len(share), bool)
+        count = float(np.sum(share[known] ** 2))
+        chosen = [Series(k, j, np.flatnonzero((experiment == k) & (output == j))) for k, j in counts]
+        series = tuple(one for one in chosen if len(one.at) >= FEWEST)
+        found = []
+        for j in dict.fromkeys(one.output for one in series):
+            own = [one for one in series if one.output == j]
+            at = np.concatenate([one.at for one in own])
+            found.append(signals(at, _parts(fit, own), leverage / share[:, None]))
+        return cls(
+            m.weights.scores(m.found.residual), share, leverage, series, tuple(found), known,
+            freedom=max(count * fit.freedom / m.weights.samples, 1.0),
+        )  # fmt: skip
+
+    def drawn(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "s m"]:
+        """Residuals as a right model would leave them."""
+        left, sizes = self._factors
+        noise, own = rng.standard_normal((count, len(self.share))), rng.standard_normal((count, len(sizes)))
+        taken = sizes * ((self.share * noise) @ left) + np.sqrt(1 - sizes**2) * own
+        return noise - (taken * sizes) @ left.T / self.share
+
+    @functools.cached_property
+    def _factors(self) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, " k"]]:
+        left, sizes, _ = np.linalg.svd(self.leverage, full_matrices=False)
+        return left, np.minimum(sizes, 1.0)
+
+    @functools.cached_property
+    def found(self) -> dict[str, float]:
+        """The probability of each test by itself, approximately."""
+        return {name: float(p[0]) for name, p in self.tested(self.scores[None]).items()}
+
+    @functools.cached_property
+    def probability(self) -> float:
+        """The probability that a right model leaves something as improbable. Draws end where it exceeds the level."""
+        if not self.found:
+            return 1.0
+        least, rng, below, drawn = min(self.found.values()), np.random.default_rng(0), 0, 0
+        batch = int(np.clip(ROOM / len(self.share), 1, BATCH))
+        while drawn < DRAWS and below + 1 <= LEVEL * (DRAWS + 1):
+            count = min(batch, DRAWS - drawn)
+            each = self.tested(self.drawn(count, rng)).values()
+            below, drawn = below + int(np.sum(np.min(list(each), axis=0) <= least)), drawn + count
+        return (below + 1) / (drawn + 1)
+
+    def tested(self, residuals: Float[np.ndarray, "s m"]) -> dict[str, Float[np.ndarray, " s"]]:
+        """The approximate probability of each test, for several sets of residuals."""
+        found: dict[str, np.ndarray] = {}
+        if self.known.any():
+            chi2 = np.sum((self.share * residuals)[:, self.known] ** 2, axis=1)
+            found["χ²"] = chdtrc(self.freedom, chi2)
+        if not self.series:
+            return found
+        scaled, spectra, neighbours = np.array(residuals), [], []
+        for one in self.series:
+            own = residuals[:, one.at]
+            size = np.sqrt(np.mean(own**2, axis=1, keepdims=True))
+            own = scaled[:, one.at] = own / np.where(size > 0, size, 1.0)
+            spectra.append(periodogram(own))
+            neighbours.append(_neighbours(own))
+        found["neighbours"] = _any([chdtrc(lags, statistic) for statistic, lags in neighbours])
+        if len(neighbours) > 1:
+            statistics, lags = zip(*neighbours, strict=True)
+            found["all neighbours"] = chdtrc(sum(lags), sum(statistics))
+        found["peak"] = _any([_peak([one]) for one in spectra])
+        together = self._together
+        if len(together) < len(spectra):
+            found["common peak"] = _any([_peak([spectra[k] for k in group]) for group in together])
+        found["slow"] = _slow(spectra, self._left)
+        squares = [np.sum((scaled[:, one.at] @ one.basis) ** 2, axis=1) for one in self.signals]
+        found["signals"] = chdtrc(sum(one.count for one in self.signals), np.sum(squares, axis=0))
+        return found
+
+    @functools.cached_property
+    def _left(self) -> list[Float[np.ndarray, " f"]]:
+        """Of the power of noise at each frequency, the part that a fit leaves."""
+        own = self.leverage / self.share[:, None]
+        return [np.maximum(1 - periodogram(own[one.at].T).sum(axis=0), 0.0) for one in self.series]
+
+    @functools.cached_property
+    def _together(self) -> list[list[int]]:
+        """The series that have their frequencies in common: of as many samples. A mode shows in all of them."""
+        sizes = [len(one.at) for one in self.series]
+        return [[k for k, n in enumerate(sizes) if n == size] for size in dict.fromkeys(sizes)]
+
+    # --- what stands out -----------------------------------------------------------------------------------------
+
+    def strongest_signal(self) -> tuple[int, str]:
+        """(the output, the name of the signal that its residuals correlate with most)."""
+        found = [(np.abs(self.scores[one.at] @ one.each), one) for one in self.signals]
+        values, one = max(found, key=lambda pair: pair[0].max())
+        output = next(s.output for s in self.series if s.at[0] in one.at)
+        return output, one.names[int(np.argmax(values))]
+
+    def slowest(self) -> int:
+        """The output with the most power at low frequencies."""
+        power = {one.output: 0.0 for one in self.series}
+        for one in self.series:
+            power[one.output] += float(np.sum(periodogram(self.scores[None, one.at])[0, : 4 * FINE]))
+        return max(power, key=lambda output: power[output])
+
+
+def periodogram(values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "s f"]:
+    """The power at frequencies half as far apart as independent ones, above zero; of mean one for white noise."""
+    n = values.shape[1]
+    return np.abs(np.fft.rfft(values, FINE * n)[:, 1 : FINE * n // 2]) ** 2 / n
+
+
+def _any(each: list[Float[np.ndarray, " s"]]) -> Float[np.ndarray, " s"]:
+    """The probability of the least of several (Bonferroni)."""
+    return np.minimum(np.min(each, axis=0) * len(each), 1.0)
+
+
+def _neighbours(own: Float[np.ndarray, "s n"]) -> tuple[Float[np.ndarray, " s"], int]:
+    """(Ljung and Box's statistic of numbers of mean square one, its lags: ln n, as Tsay 2010 advises)."""
+    n = own.shape[1]
+    lags = max(int(np.log(n)), 1)
+    terms = [(np.sum(own[:, k:] * own[:, :-k], axis=1) / n) ** 2 / (n - k) for k in range(1, lags + 1)]
+    return n * (n + 2) * np.sum(terms, axis=0), lags
+
+
+def _peak(spectra: list[Float[np.ndarray, "s f"]]) -> Float[np.ndarray, " s"]:
+    """The probability of the highest peak of some spectra together: χ² at each frequency, times how many there are, of
+    which neighbours depend on each other."""
+    highest = np.max(sum(spectra), axis=1)
+    return np.minimum(0.75 * spectra[0].shape[1] * chdtrc(2 * len(spectra), 2 * highest), 1.0)
+
+
+def _slow(spectra: list[Float[np.ndarray, "s f"]], left: list[Float[np.ndarray, " f"]]) -> Float[np.ndarray, " s"]:
+    """The probability of the power at the lowest frequencies of all spectra together, up to a quarter of them."""
+    chosen = [k for k, one in enumerate(spectra) if one.shape[1] >= SHORTEST * FINE]
+    if not chosen:
+        return np.ones(len(spectra[0]))
+    lines = [np.concatenate([left[k][None], spectra[k]])[:, FINE - 1 :: FINE] for k in chosen]
+    each = []
+    for count in 2 ** np.arange(int(np.log2(max(one.shape[1] for one in lines) / 4)) + 1):
+        power = np.sum([2 * np.sum(one[:, : min(count, one.shape[1] // 4)], axis=1) for one in lines], axis=0)
+        each.append(chdtrc(max(power[0], 1.0), power[1:]))
+    return _any(each)
+
+
+def signals(
+    at: Int[np.ndarray, " n"],
+    parts: list[tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]],
+    leverage: Float[np.ndarray, "m r"],
+) -> Signals:
+    """The signals of one output: constants and drifts; its predictions, their rates, squares and cubes, and what these
+    become if they drift; and inputs. A gain that is wrong shows as the prediction, a delay as its rate.
+
+    - `parts`: (predictions, times, inputs by name) of each experiment.
+    """
+    rows = []
+    for y, t, inputs in parts:
+        tau = 2 * (t - t.mean()) / (np.ptp(t) or 1.0)
+        rows.append(np.stack([y, np.gradient(y, t), tau, *inputs.values()]))
+    (y, rate, tau, *others) = (row - row.mean() for row in np.concatenate(rows, axis=1))
+    found = {
+        "a constant": np.ones_like(y), "the prediction": y, "the rate of change of the prediction": rate,
+        **{f"the input '{name}'": u for name, u in zip(parts[0][2], others, strict=True)},
+        "time": tau, "a drift of its gain": y * tau, "a drift in time": rate * tau,
+        "the square of the prediction": y * y, "the cube of the prediction": y**3,
+        "the square of its rate": rate * rate, "the prediction times its rate": y * rate,
+        "the square of time": tau * tau,
+    }  # fmt: skip
+    columns = np.stack(list(found.values()), axis=1)
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
+    basis, values, _ = np.linalg.svd(columns, full_matrices=False)
+    basis = basis[:, values > ALIKE * values[0]]
+    count = max(basis.shape[1] - float(np.sum((leverage[at].T @ basis) ** 2)), 1.0)
+    return Signals(at, basis, count, tuple(found), columns)
+
+
+def _parts(fit: "Estimate", series: list[Series]) -> list[tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]]:
+    """(predictions, times, inputs) of some series."""
+    s, rows, parts = fit.objective.stacked, fit.objective.rows[1], []
+    for one in series:
+        k, i = one.experiment, rows[one.at]
+        t = s.times[k, i]
+        inputs = {name: np.interp(t, times[k], values[k]) for name, (times, values) in s.inputs.items()}
+        parts.append((fit.minimum.found.residual[one.at] + s.values[k, i, one.output], t, inputs))
+    return parts
