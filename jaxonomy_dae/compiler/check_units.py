@@ -75,14 +75,13 @@ class _DeclaredUnits:
         self.variables: list[Unit | None] = [None] * model.n_variables
         self.parameters: list[Unit | None] = [None] * model.n_parameters
         for i in model.instances:
-            for k, (name, declared) in enumerate(i.component.variables.items()):
-                unit = read(f"{model.path(i)}.{name}", declared)
-                for v in (i.variable + k).tolist():
-                    self.variables[v] = unit
-            for k, (name, declared) in enumerate(i.component.parameters.items()):
-                unit = read(f"{model.path(i)}.{name}", declared)
-                for p in (i.parameter + k).tolist():
-                    self.parameters[p] = unit
+            of_variables = self.variables, i.variable, i.component.variables
+            of_parameters = self.parameters, i.parameter, i.component.parameters
+            for units, first, declarations in (of_variables, of_parameters):
+                for k, (name, declared) in enumerate(declarations.items()):
+                    unit = read(f"{model.path(i)}.{name}", declared)
+                    for place in (first + k).tolist():
+                        units[place] = unit
         for found in texts.values():
             more = f" ({len(found) - 1} more have it)" if len(found) > 1 else ""
             self.unknown.append(found[0] + more)

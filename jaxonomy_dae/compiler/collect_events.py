@@ -1,5 +1,6 @@
 """The events of all components, as one table."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -26,19 +27,13 @@ def event_table(model: ModelNumbers) -> EventTable:
         return EventTable(left_alone=left_alone)
     found.sort(key=lambda entry: (entry[4].clock is None, entry[0], entry[1]))
     place = {int(p): i for i, p in enumerate(model.discrete)}
-    known: dict[tuple[int, str, bool], np.ndarray] = {}
+    variables, parameters = functools.cache(model.variable), functools.cache(model.parameter)
 
     def variable(i: Instances, path: str, row: int) -> int:
-        key = (id(i), path, True)
-        if key not in known:
-            known[key] = model.variable(i, path)
-        return int(known[key][row])
+        return int(variables(i, path)[row])
 
     def parameter(i: Instances, path: str, row: int) -> int:
-        key = (id(i), path, False)
-        if key not in known:
-            known[key] = model.parameter(i, path)
-        return int(known[key][row])
+        return int(parameters(i, path)[row])
 
     def in_parameters(i: Instances, row: int, expression: sympy.Expr) -> Start:
         symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: parameter(i, s.path, row))

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
+from ..model.entries import slots_of
 from ..model.group import Columns
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenances
@@ -125,17 +126,8 @@ def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], Alia
 
 def _terms_of(groups: Sequence[EquationGroup]) -> tuple[_Terms, int]:
     """The terms of all rows, and how many rows there are."""
-    first = np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(np.int64)
-    row = [np.repeat(k + np.arange(len(g)), g.variable.shape[1]) for k, g in zip(first[:-1], groups, strict=True)]
-    none = [np.zeros(0, np.int64)]
     coefficient = np.concatenate([np.zeros(0), *(g.coefficient.ravel() for g in groups)])
-    return _Terms(
-        np.concatenate(none + row),
-        np.concatenate(none + [g.variable.ravel() for g in groups]),
-        np.concatenate(none + [g.order.ravel() for g in groups]),
-        coefficient,
-        NOISE * EPS * np.abs(coefficient),
-    ), int(first[-1])
+    return _Terms(*slots_of(groups), coefficient, NOISE * EPS * np.abs(coefficient)), sum(map(len, groups))
 
 
 def _canonical(terms: _Terms, classes: _Classes) -> _Terms:

@@ -9,6 +9,7 @@ one of lowest cᵢ, and index reduction starts again: the linear combination met
 
 from collections.abc import Sequence
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
@@ -146,13 +147,10 @@ def _numeric_combination(
     jacobian: HighestDerivatives, equations: np.ndarray, columns: np.ndarray, weights: Row
 ) -> tuple[int, EquationGroup]:
     """An equation of a block, and the combination of equations with these weights that replaces it."""
-    used = np.array(sorted(weights), np.int64)
-    sources = [provenance_of(jacobian.groups, int(e)) for e in equations[used]]
-    written, unit, top = _written(jacobian, equations, columns, used)
-    if written is None:
-        raise StructuralError(_hidden(sources))
-    chosen: list[Node] = [constant(weights[int(k)] / weights[int(used[unit])]) for k in used]
-    return _replacement(jacobian, equations, used, written, chosen, unit, top, sources, np.zeros(0, np.int64))
+    used = sorted(weights)
+    parts = _parts(jacobian, equations[used], columns)
+    chosen: list[Node] = [constant(weights[k] / weights[used[parts.unit]]) for k in used]
+    return _replacement(jacobian, parts, chosen, np.zeros(0, np.int64))
 
 
 def _sampled_combination(
@@ -180,54 +178,58 @@ def _sampled_combination(
         if any(matrix.is_finite and not null_vectors(matrix) for matrix in natural):
             return None
     everywhere = null_vectors(together)
-    provenance = [provenance_of(groups, int(e)) for e in equations]
     if not everywhere:
-        raise StructuralError(_hidden(provenance))
-    used = np.array(sorted(everywhere[0]), np.int64)
-    written, unit, top = _written(jacobian, equations, columns, used)
-    if written is None:
-        raise StructuralError(_hidden(provenance))
-    sources = [provenance[k] for k in used]
-    found = _weights(written, top, unit, jacobian.values, discrete, trials)
+        raise StructuralError(_hidden([provenance_of(groups, int(e)) for e in equations]))
+    parts = _parts(jacobian, equations[sorted(everywhere[0])], columns)
+    found = _weights(parts, jacobian.values, discrete, trials)
     if found is None:
-        here = [jacobian.place(e) for e in equations[used].tolist()]
+        here = [jacobian.place(e) for e in parts.equations.tolist()]
         concerned = list(dict.fromkeys(p for g, i in here for p in groups[g].parameter[i].tolist()))
         if not concerned:  # numbers alone, which cancel to rounding
-            raise StructuralError(_hidden(sources))
-        raise StructuralError(
-            "\n".join([_for_values(jacobian, equations, names, concerned, discrete), *itemised(sources)])
-        )
-    if any(has_branches(slope_left(written, found, label), of_parameters=False) for label in top):
+            raise StructuralError(_hidden(parts.sources))
+        said = _for_values(jacobian, equations, names, concerned, discrete)
+        raise StructuralError("\n".join([said, *itemised(parts.sources)]))
+    if any(has_branches(slope_left(parts.graphs, found, label), of_parameters=False) for label in parts.top):
         return None  # regular in general: singular where a condition says so
-    return _replacement(jacobian, equations, used, written, found, unit, top, sources, discrete)
+    return _replacement(jacobian, parts, found, discrete)
 
 
-def _written(
-    jacobian: HighestDerivatives, equations: np.ndarray, columns: np.ndarray, used: np.ndarray
-) -> tuple[list[Node] | None, int, list]:
-    """The equations at `used`, differentiated so that the same derivatives are their highest, None if one of them is a
-    function that is evaluated in JAX only; the place of one that is not differentiated; and what cancels."""
-    c = jacobian.offsets.equation[equations[used]]
-    written = []
-    for e, k in zip(equations[used].tolist(), (c - c.min()).tolist(), strict=True):
-        g, i = jacobian.place(e)
-        written.append(graph_of(jacobian.groups[g], i, k))
-    unit, top = int(np.flatnonzero(c == c.min())[0]), _highest(jacobian, columns, int(c.min()))
-    return (None if any(graph is None for graph in written) else written), unit, top
+class _Parts(NamedTuple):
+    """Equations to be combined: their numbers, and graphs of them, differentiated so that the same derivatives are
+    their highest; the place of one that is not differentiated; the labels of what cancels; who wrote them."""
+
+    equations: np.ndarray
+    graphs: list[Node]
+    unit: int
+    top: list
+    sources: list[Provenance]
+
+
+def _parts(jacobian: HighestDerivatives, equations: np.ndarray, columns: np.ndarray) -> _Parts:
+    """**Raises:** `StructuralError` for a function that is evaluated in JAX only."""
+    c = jacobian.offsets.equation[equations]
+    lowest = int(c.min())
+    places = [jacobian.place(e) for e in equations.tolist()]
+    graphs = [graph_of(jacobian.groups[g], i, k) for (g, i), k in zip(places, (c - lowest).tolist(), strict=True)]
+    sources = [jacobian.groups[g].provenance[i] for g, i in places]
+    known = [graph for graph in graphs if graph is not None]
+    if len(known) < len(graphs):
+        raise StructuralError(_hidden(sources))
+    return _Parts(equations, known, int(np.argmin(c)), _highest(jacobian, columns, lowest), sources)
 
 
 def _replacement(
-    jacobian: HighestDerivatives, equations: np.ndarray, used: np.ndarray, written: Sequence[Node],
-    weights: Sequence[Node], unit: int, top: list, sources: list[Provenance], discrete: np.ndarray,
-) -> tuple[int, EquationGroup]:  # fmt: skip
+    jacobian: HighestDerivatives, parts: _Parts, weights: Sequence[Node], discrete: np.ndarray
+) -> tuple[int, EquationGroup]:
     """The equation at `unit`, and Σ weight·equation in its place, in which the quantities `top` are gone."""
-    combined = combine(written, weights, top, jacobian.values, discrete, lambda: jacobian.natural(equations[used]))
+    equations, graphs, unit, top, sources = parts
+    combined = combine(graphs, weights, top, jacobian.values, discrete, lambda: jacobian.natural(equations))
     if combined is None:
         raise StructuralError(_hidden(sources))
     if not any(label[0] == "quantity" for label in combined.leaves):
         raise StructuralError(_dependent(sources))
     origin = combination(sources) if len(sources) > 1 else sources[0]
-    return int(equations[used[unit]]), group_of(combined, origin)
+    return int(equations[unit]), group_of(combined, origin)
 
 
 def _for_values(
@@ -276,13 +278,11 @@ def _highest(jacobian: HighestDerivatives, columns: np.ndarray, lowest: int) -> 
     return [quantity_label(variable_of[int(j)], int(jacobian.offsets.variable[j]) - lowest) for j in columns]
 
 
-def _weights(
-    written: Sequence[Node], top: Sequence, unit: int, values: np.ndarray, discrete: np.ndarray, trials: Sequence[int]
-) -> list[Node] | None:
+def _weights(parts: _Parts, values: np.ndarray, discrete: np.ndarray, trials: Sequence[int]) -> list[Node] | None:
     """Weights in parameters with which the quantities `top` cancel in the equations; the one at `unit` is 1."""
-    place = {label: k for k, label in enumerate(top)}
+    place = {label: k for k, label in enumerate(parts.top)}
     rows: list[dict[int, Node]] = []
-    for equation in written:
+    for equation in parts.graphs:
         row: dict[int, Node] = {}
         for label in sorted(equation.leaves & place.keys(), key=place.__getitem__):
             graph = partial_derivative(equation, label)
@@ -291,7 +291,7 @@ def _weights(
                 point = {leaf: constant(float(tried(leaf[1], leaf[2], trial))) for leaf in moving}
                 if TIME_LABEL in graph.leaves:
                     point[TIME_LABEL] = constant(0.37 + 0.1 * trial)
-                row[place[label] + k * len(top)] = substitute(graph, point) if point else graph
+                row[place[label] + k * len(place)] = substitute(graph, point) if point else graph
         rows.append(row)
     labels = sorted(frozenset().union(*(g.leaves for row in rows for g in row.values())), key=repr)
     samples = np.array([near(values, k, discrete) for k in range(PARAMETERS if labels else 1)])
@@ -301,7 +301,7 @@ def _weights(
         values, errors = KernelWithErrors(graphs, labels)(columns, [KNOWN * np.abs(column) for column in columns])
         return _over(values, len(samples)), _over(errors, len(samples))
 
-    return weights_in_parameters(rows, evaluate, unit)
+    return weights_in_parameters(rows, evaluate, parts.unit)
 
 
 def _over(values: Sequence, n: int) -> np.ndarray:

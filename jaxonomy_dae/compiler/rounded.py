@@ -6,18 +6,26 @@ it, a number says whether it is zero: 1e-3·3.6·x − 0.0036·x is, and 1e-15·
 
 import dataclasses
 
+import numpy as np
+
 from ..tolerances import EPS
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Rounded:
-    """A value and a bound of its error; false where it may be zero."""
+    """A value and a bound of its error, or several at once; false where all of them may be zero."""
 
-    value: float
-    error: float
+    value: float | np.ndarray
+    error: float | np.ndarray
 
     def __bool__(self) -> bool:
-        return abs(self.value) > self.error
+        seen = abs(self.value) > self.error
+        return seen if isinstance(seen, bool) else bool(np.any(seen))
+
+    @property
+    def may_vanish(self) -> bool:
+        """True if one of the values may be zero."""
+        return bool(np.any(abs(self.value) <= self.error))
 
     def __neg__(self) -> "Rounded":
         return Rounded(-self.value, self.error)

@@ -18,7 +18,7 @@ from ..diagnosis.redundant_constraints import ModelAt, dependent_constraints
 from ..errors import StructuralError
 from ..judgement.rank import above_errors, rank_of
 from ..model.consistent_point import initial_point
-from ..model.constraint_jacobian import constraint_entries, evaluate, evaluate_errors, independent_parts
+from ..model.constraint_jacobian import constraint_entries, independent_parts, values_and_errors
 from ..model.declared import declared_scale
 from ..model.extended import Extended
 from ..model.group import Point
@@ -129,9 +129,8 @@ def select_states(model: ReducedModel, mode: str, merit: np.ndarray) -> StateSel
                 continue
             if at is None:
                 at, scale = initial_point(model, model.flat.declares), _scale(model)
-                numbers = evaluate(groups, extended, entries, at)
-                known = KNOWN * (np.abs(at.values[:-1]) + typical_sizes(model, at.parameters))
-                errors = evaluate_errors(groups, extended, entries, at, known)
+                known = KNOWN * (np.abs(at.values) + np.append(typical_sizes(model, at.parameters), 0.0))
+                numbers, errors = values_and_errors(groups, extended, entries, at, known)
             columns = np.unique(entries.column[members])
             dense, bounds = np.zeros((2, len(rows), len(columns)))
             place = np.searchsorted(rows, entries.row[members]), np.searchsorted(columns, entries.column[members])

@@ -10,53 +10,36 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..expressions.node import ONE, ZERO, Node, constant, divide, linear, multiply, number
-from ..tolerances import CANCELLED, EPS, KNOWN
+from ..tolerances import CANCELLED, KNOWN
 from . import elimination
 from .null_vectors import rational
+from .rounded import Rounded
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Sampled:
-    """A function of the parameters, its values at sample points and bounds of their errors; false where all of these
-    may be zero."""
+    """A function of the parameters, and its values at sample points; false where all of these may be zero."""
 
     graph: Node
-    value: np.ndarray  # (samples,)
-    error: np.ndarray
+    value: Rounded  # arrays, (samples,)
 
     def __bool__(self) -> bool:
-        return self.graph is not ZERO and bool((np.abs(self.value) > self.error).any())
-
-    @property
-    def may_vanish(self) -> bool:
-        """True if the function may be zero at one of the points."""
-        return bool((np.abs(self.value) <= self.error).any())
+        return self.graph is not ZERO and bool(self.value)
 
     def __neg__(self) -> "Sampled":
-        return Sampled(linear([(-1, self.graph)]), -self.value, self.error)
+        return Sampled(linear([(-1, self.graph)]), -self.value)
 
     def __add__(self, other: "Sampled") -> "Sampled":
-        value = self.value + other.value
-        return Sampled(linear([(1, self.graph), (1, other.graph)]), value, _sum(self, other, value))
+        return Sampled(linear([(1, self.graph), (1, other.graph)]), self.value + other.value)
 
     def __sub__(self, other: "Sampled") -> "Sampled":
-        value = self.value - other.value
-        return Sampled(linear([(1, self.graph), (-1, other.graph)]), value, _sum(self, other, value))
+        return Sampled(linear([(1, self.graph), (-1, other.graph)]), self.value - other.value)
 
     def __mul__(self, other: "Sampled") -> "Sampled":
-        value = self.value * other.value
-        error = np.abs(self.value) * other.error + np.abs(other.value) * self.error + self.error * other.error
-        return Sampled(multiply(self.graph, other.graph), value, error + EPS * np.abs(value))
+        return Sampled(multiply(self.graph, other.graph), self.value * other.value)
 
     def __truediv__(self, other: "Sampled") -> "Sampled":
-        value = self.value / other.value
-        least = np.abs(other.value) - other.error
-        error = (self.error + np.abs(value) * other.error) / least + EPS * np.abs(value)
-        return Sampled(divide(self.graph, other.graph), value, error)
-
-
-def _sum(a: Sampled, b: Sampled, value: np.ndarray) -> np.ndarray:
-    return a.error + b.error + EPS * np.abs(value)
+        return Sampled(divide(self.graph, other.graph), self.value / other.value)
 
 
 @np.errstate(all="ignore")  # a quotient without a value is found in the end
@@ -80,22 +63,24 @@ def weights_in_parameters(
         return None
     sampled: list[elimination.Row] = [{} for _ in rows]
     for (i, c, graph), value, error in zip(entries, numbers, errors, strict=True):
-        found = Sampled(graph, value, np.maximum(error, KNOWN * np.abs(value)))  # given numbers are known to that
+        # Given numbers are known to that.
+        found = Sampled(graph, Rounded(value, np.maximum(error, KNOWN * np.abs(value))))
         if found:
             sampled[i][c] = found
-    one = Sampled(ONE, np.ones(numbers.shape[1]), np.zeros(numbers.shape[1]))
-    found = elimination.null_vectors(sampled, one, lambda entry: entry.may_vanish)
+    one = Sampled(ONE, Rounded(np.ones(numbers.shape[1]), np.zeros(numbers.shape[1])))
+    found = elimination.null_vectors(sampled, one, lambda entry: entry.value.may_vanish)
     if len(found) != 1 or unit not in found[0]:
         return None
     by = found[0][unit]
     quotients = [found[0].get(i, one - one) / by for i in range(len(rows))]
-    if not all(np.isfinite(quotient.value).all() for quotient in quotients):
+    if not all(np.isfinite(quotient.value.value).all() for quotient in quotients):
         return None
     return [_simplest(quotient) for quotient in quotients]
 
 
 def _simplest(weight: Sampled) -> Node:
     """Its graph, a number where its values are the same."""
-    first = float(weight.value[0])
-    is_number = (np.abs(weight.value - first) <= CANCELLED * abs(first)).all()
+    values = np.asarray(weight.value.value)
+    first = float(values[0])
+    is_number = (np.abs(values - first) <= CANCELLED * abs(first)).all()
     return constant(rational(first)) if is_number else weight.graph

@@ -29,10 +29,9 @@ from ..linear.sparse_least_squares import SparseLeastSquares
 from ..model.constraint_jacobian import (
     ConstraintEntries,
     constraint_entries,
-    evaluate,
-    evaluate_along,
-    evaluate_errors,
+    gathered,
     independent_parts,
+    values_and_errors,
 )
 from ..model.group import Point
 from ..model.linear_template import LinearTemplate
@@ -131,7 +130,7 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
     def matrix_of(numbers: np.ndarray) -> sp.csr_array:
         return sp.csr_array((numbers, place), shape=(len(rows), len(columns)))
 
-    where = at.model.groups, at.model.extended, entries, at.point
+    where = at.model.groups, at.model.extended, entries
     matrix, bounds = map(matrix_of, _values_and_errors(at, entries))
     if not np.isfinite(matrix.data).all():
         return []
@@ -150,9 +149,10 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
     changed = np.zeros((left.shape[1], right.shape[1], right.shape[1]))
     size = np.zeros_like(changed)
     for k in range(right.shape[1]):
-        move = np.zeros(at.model.extended.quantities.n)
+        move = np.zeros(at.model.extended.quantities.n + 1)
         move[position] = column_scale * right[:, k]
-        slope: Any = sp.diags_array(row_scale) @ matrix_of(evaluate_along(*where, move)) @ sp.diags_array(column_scale)
+        rates = gathered(*where, lambda group, move=move: group.partials_along(at.point, move))
+        slope: Any = sp.diags_array(row_scale) @ matrix_of(rates) @ sp.diags_array(column_scale)
         if not np.isfinite(slope.data).all():
             return []
         changed[:, k] = left.T @ (slope @ right)
@@ -171,9 +171,8 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
 
 def _values_and_errors(at: ModelAt, entries: ConstraintEntries) -> tuple[np.ndarray, np.ndarray]:
     """The entries of the Jacobian, and bounds of their errors."""
-    where = at.model.groups, at.model.extended, entries, at.point
-    known = KNOWN * (np.abs(at.point.values[:-1]) + at.error_sizes)
-    return evaluate(*where), evaluate_errors(*where, known)
+    known = KNOWN * (np.abs(at.point.values) + np.append(at.error_sizes, 0.0))
+    return values_and_errors(at.model.groups, at.model.extended, entries, at.point, known)
 
 
 class _Sampled(NamedTuple):

@@ -11,21 +11,20 @@ from jaxtyping import Bool
 
 from ..lowering.plan import SystemPlan
 from ..lowering.remembered import remembered
+from ..model.entries import slots_of
+from ..model.tables import ZERO
 
 
 @remembered
 def integrated(plan: SystemPlan) -> Bool[np.ndarray, " quantities"]:
     """True for every quantity with a derivative in the equations of the model, before index reduction."""
     quantities, groups = plan.extended.quantities, plan.model.groups
-    sizes = np.cumsum([0, *(len(group) for group in groups)])
-    row = [np.repeat(np.arange(len(g)) + first, g.variable.shape[1]) for g, first in zip(groups, sizes, strict=False)]
-    column = [quantities.column[group.variable.ravel()] for group in groups]
-    order = [group.order.ravel() for group in groups]
-    row, column, order = (np.concatenate([np.zeros(0, np.int64), *parts]) for parts in (row, column, order))
+    row, variable, order = slots_of(groups)
+    column = np.where(variable == ZERO, -1, quantities.column[variable])
     known = column >= 0
     row, column, order = row[known], column[known], order[known]
     columns = len(quantities.highest)
-    kept = _read(row, column, order, int(sizes[-1]), columns)[row]
+    kept = _read(row, column, order, sum(map(len, groups)), columns)[row]
     highest = np.zeros(columns, np.int64)
     np.maximum.at(highest, column[kept], order[kept])
     return quantities.order < highest[quantities.owner]

@@ -70,31 +70,14 @@ def independent_parts(entries: ConstraintEntries, constrained: np.ndarray, shape
     return [(np.array(rows), np.array(members[key], np.int64)) for key, rows in by_label.items()]
 
 
-def evaluate(
-    groups: tuple[EquationGroup, ...], extended: Extended, entries: ConstraintEntries, at: Point
+def gathered(
+    groups: tuple[EquationGroup, ...],
+    extended: Extended,
+    entries: ConstraintEntries,
+    of_group: Callable[[ExtendedGroup], np.ndarray],
 ) -> np.ndarray:
-    """The numbers of all entries."""
-    return _gathered(groups, extended, entries, lambda g: g.partials(at))
-
-
-def evaluate_along(
-    groups: tuple[EquationGroup, ...], extended: Extended, entries: ConstraintEntries, at: Point, move: np.ndarray
-) -> np.ndarray:
-    """The rate of change of these numbers where all quantities move by `move`."""
-    padded = np.append(move, 0.0)
-    return _gathered(groups, extended, entries, lambda g: g.partials_along(at, padded))
-
-
-def evaluate_errors(
-    groups: tuple[EquationGroup, ...], extended: Extended, entries: ConstraintEntries, at: Point, errors: np.ndarray
-) -> np.ndarray:
-    """Bounds of the errors of these numbers, from those of all quantities."""
-    padded = np.append(errors, 0.0)
-    return _gathered(groups, extended, entries, lambda g: g.partial_errors(at, padded))
-
-
-def _gathered(groups, extended: Extended, entries: ConstraintEntries, of_group: Callable[[ExtendedGroup], np.ndarray]):
-    """From arrays (n, slots) of the groups as written, what belongs to the entries."""
+    """The numbers of all entries, from arrays (n, slots) of the groups as written: partial derivatives, bounds of their
+    errors, or their rates of change."""
     by_base = {}
     first = equation_offsets(groups)
     for group in extended.groups:
@@ -106,3 +89,13 @@ def _gathered(groups, extended: Extended, entries: ConstraintEntries, of_group: 
         here = entries.group == g
         numbers[here] = of_group(by_base[int(g)])[entries.instance[here], entries.slot[here]]
     return numbers
+
+
+def values_and_errors(
+    groups: tuple[EquationGroup, ...], extended: Extended, entries: ConstraintEntries, at: Point, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of all entries at a point, and bounds of their errors, from those of all quantities, (quantities +
+    1,)."""
+    where = groups, extended, entries
+    errors = gathered(*where, lambda group: group.partial_errors(at, known))
+    return gathered(*where, lambda group: group.partials(at)), errors

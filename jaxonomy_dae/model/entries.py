@@ -1,12 +1,13 @@
 """The incidence of equations, and their entries as flat arrays with numeric coefficients where these are numbers."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..structure.incidence import Incidence, compress
 from .group import Columns
-from .tables import ZERO, EquationGroup
+from .tables import ZERO, EquationGroup, equation_offsets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,35 +22,31 @@ class Entries(Columns):
 
 
 def entries_of(groups: tuple[EquationGroup, ...], unknown: np.ndarray) -> Entries:
-    rows, variables, orders, coefficients = [], [], [], []
-    first = 0
-    for group in groups:
-        n, k = group.variable.shape
-        used = group.variable != ZERO
-        used &= unknown[group.variable]
-        rows.append(np.broadcast_to(np.arange(first, first + n)[:, None], (n, k))[used])
-        variables.append(group.variable[used])
-        orders.append(group.order[used])
-        coefficients.append((group.template.numbers(group.coefficient) * group.factor)[used])
-        first += n
-    row, variable, order = (np.concatenate(a) if a else np.zeros(0, np.int64) for a in (rows, variables, orders))
-    return Entries(row, variable, order, np.concatenate(coefficients) if coefficients else np.zeros(0), first)
+    row, variable, order = slots_of(groups)
+    numbers = [group.template.numbers(group.coefficient) * group.factor for group in groups]
+    coefficient = np.concatenate([np.zeros(0), *(number.ravel() for number in numbers)])
+    used = variable != ZERO
+    used[used] = unknown[variable[used]]
+    entries = Entries(row, variable, order, coefficient, int(equation_offsets(groups)[-1]))
+    return entries.take(used)
+
+
+def slots_of(groups: Sequence[EquationGroup]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(equation, variable, order) of all slots, row by row."""
+    none, first = [np.zeros(0, np.int64)], equation_offsets(groups)
+    row = [np.repeat(k + np.arange(len(g)), g.variable.shape[1]) for k, g in zip(first[:-1], groups, strict=True)]
+    return (
+        np.concatenate(none + row),
+        np.concatenate(none + [group.variable.ravel() for group in groups]),
+        np.concatenate(none + [group.order.ravel() for group in groups]),
+    )
 
 
 def incidence(groups: tuple[EquationGroup, ...], column: np.ndarray, n_columns: int) -> Incidence:
     """The incidence of all equations; column[v] is the unknown's number of variable v, or −1 if v is known."""
-    rows, columns, orders = [], [], []
-    first = 0
-    for group in groups:
-        n, k = group.variable.shape
-        row = np.repeat(np.arange(first, first + n), k)
-        variable = group.variable.ravel()
-        used = variable != ZERO
-        used[used] = column[variable[used]] >= 0
-        rows.append(row[used])
-        columns.append(column[variable[used]])
-        orders.append(group.order.ravel()[used])
-        first += n
-    row, variable, order = (np.concatenate(a) if a else np.zeros(0, np.int64) for a in (rows, columns, orders))
-    pointer, variable, order = compress(row, variable, order, first)
+    row, variable, order = slots_of(groups)
+    used = variable != ZERO
+    used[used] = column[variable[used]] >= 0
+    n_rows = int(equation_offsets(groups)[-1])
+    pointer, variable, order = compress(row[used], column[variable[used]], order[used], n_rows)
     return Incidence(pointer, variable, order, n_columns)

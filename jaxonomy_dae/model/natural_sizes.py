@@ -81,10 +81,10 @@ def natural_sizes(
     begun = np.log10(np.abs(np.append(quantity, parameter)))
     constants, time = _constants(groups, parameters), 0.0
     for _ in range(ROUNDS):
-        entries = _seen(groups, quantity, parameter, _Entries)
+        entries = _seen(groups, quantity, parameter, False)
         if not len(entries.logarithm):
             break
-        seen = [entries, constants] + ([_seen(groups, quantity, parameter, _Terms)] if by_terms else [])
+        seen = [entries, constants] + ([_seen(groups, quantity, parameter, True)] if by_terms else [])
         matrix: Any = sp.vstack([s.powers(n, n_parameters, n_equations) for s in seen], format="csr")
         matrix.data[known[matrix.indices]] = 0.0
         off = np.concatenate([s.logarithm for s in seen])
@@ -164,11 +164,14 @@ def _constants(groups: Sequence[QuantityGroup], parameters: np.ndarray) -> _Seen
     return _Seen(np.concatenate(values), np.concatenate(equations), none, none, 0)
 
 
-def _seen(
-    groups: Sequence[QuantityGroup], quantity: np.ndarray, parameter: np.ndarray, of: type["_Entries"] | type["_Terms"]
-) -> _Seen:
-    """Evaluates the entries, or the terms, of the groups at a generic point. Entries are multiplied by the sizes of the
-    quantities to which they belong."""
+def _seen(groups: Sequence[QuantityGroup], quantity: np.ndarray, parameter: np.ndarray, of_terms: bool) -> _Seen:
+    """Evaluates |∂F_e/∂x_q| of each slot, or |term| of each term of F_e, at a generic point. The former are multiplied
+    by the sizes of the quantities to which they belong."""
+
+    def sizes(own: QuantityGroup, quantities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        at = Point.of(quantities.ravel(), parameters.ravel(), 0.5)
+        return np.abs(own.terms(at) if of_terms else own.partials(at))
+
     rng = np.random.default_rng(1)
     point, parameters = quantity * generic(rng, quantity.shape), parameter * generic(rng, parameter.shape)
     logarithms: list[np.ndarray] = [np.zeros(0)]
@@ -180,9 +183,9 @@ def _seen(
             continue
         own = group.apart()
         arguments = np.append(point, 0.0)[group.quantity], parameters[group.parameter]
-        size = of.sizes(own, *arguments)
+        size = sizes(own, *arguments)
         used = (size > 0) & np.isfinite(size)
-        if of is _Entries:
+        if not of_terms:
             used &= group.quantity != ZERO
         if not used.any():
             continue
@@ -190,23 +193,24 @@ def _seen(
         place[used] = first + np.arange(used.sum())
         first += int(used.sum())
         logarithm = np.log10(size[used])
-        if of is _Entries:
+        if not of_terms:
             column = group.quantity[used]
             logarithm = logarithm + np.log10(np.abs(point[column]))
             powers[0].append((place[used], column, np.ones(len(column))))
         logarithms.append(logarithm)
         equations.append(np.broadcast_to(group.equation[:, None], used.shape)[used])
-        for side, (ids, readers) in enumerate(zip((group.quantity, group.parameter), of.read(group), strict=True)):
+        read = group.template.readers_of_terms() if of_terms else group.template.readers_of_partials()
+        for side, (ids, readers) in enumerate(zip((group.quantity, group.parameter), read, strict=True)):
             for owner in _apart(readers, size.shape[1]):
                 moved = list(arguments)
                 moved[side] = arguments[side].copy()
                 moved[side][:, np.unique(owner[owner >= 0])] *= 1 + STEP
                 with np.errstate(all="ignore"):
-                    power = np.log(of.sizes(own, *moved) / size) / np.log1p(STEP)
+                    power = np.log(sizes(own, *moved) / size) / np.log1p(STEP)
                 moving = ids[:, owner]
                 hit = used & np.isfinite(power) & (np.abs(power) > 1e-6) & (owner >= 0) & (moving != ZERO)
                 powers[side].append((place[hit], moving[hit], np.clip(power[hit], -STEEPEST, STEEPEST)))
-    n_own = first if of is _Entries else 0
+    n_own = 0 if of_terms else first
     return _Seen(np.concatenate(logarithms), np.concatenate(equations), _joined(powers[0]), _joined(powers[1]), n_own)
 
 
@@ -224,30 +228,6 @@ def _apart(readers: Sequence[frozenset[int]], n: int) -> Iterator[np.ndarray]:
             sets.append(owner := np.full(n, -1))
         owner[reading] = k
     yield from sets
-
-
-class _Entries:
-    """|∂F_e/∂x_q| for each slot."""
-
-    @staticmethod
-    def sizes(group: QuantityGroup, quantities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return np.abs(group.partials(Point.of(quantities.ravel(), parameters.ravel(), 0.5)))
-
-    @staticmethod
-    def read(group: QuantityGroup) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
-        return group.template.readers_of_partials()
-
-
-class _Terms:
-    """|term| for each term of F_e."""
-
-    @staticmethod
-    def sizes(group: QuantityGroup, quantities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return np.abs(group.terms(Point.of(quantities.ravel(), parameters.ravel(), 0.5)))
-
-    @staticmethod
-    def read(group: QuantityGroup) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
-        return group.template.readers_of_terms()
 
 
 def _joined(powers: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

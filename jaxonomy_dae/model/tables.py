@@ -202,19 +202,19 @@ class AliasTable:
     replaced: np.ndarray  # the variable that each of these replaced
 
 
-def equation_offsets(groups: tuple[EquationGroup, ...]) -> np.ndarray:
+def equation_offsets(groups: Sequence[EquationGroup]) -> np.ndarray:
     """First equation id of each group, and the total."""
     return np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(np.int64)
 
 
-def locate(groups: tuple[EquationGroup, ...], equation: int) -> tuple[EquationGroup, int]:
+def locate(groups: Sequence[EquationGroup], equation: int) -> tuple[EquationGroup, int]:
     """The group of an equation, and its place there."""
     offsets = equation_offsets(groups)
     g = int(np.searchsorted(offsets, equation, side="right") - 1)
     return groups[g], equation - int(offsets[g])
 
 
-def provenance_of(groups: tuple[EquationGroup, ...], equation: int) -> Provenance:
+def provenance_of(groups: Sequence[EquationGroup], equation: int) -> Provenance:
     """The provenance of an equation."""
     group, place = locate(groups, equation)
     return group.provenance[place]
