@@ -18,8 +18,8 @@ from ..system.inputs import read_inputs, value_at
 from ..system.system import AcausalSystem
 from .events_at_rest import resting_events
 from .operating_point import OperatingPoint
-from .partials import Partials, compiled_partials, on_tangent, partials_at
-from .sampled import Sampled, sampled_space
+from .partials import Driven, Partials, compiled_partials, on_tangent, partials_at
+from .sampled import sampled_space
 from .state_space import StateSpace
 from .steady_state import Drifting, check_system, equilibrium_from, is_traced, point_of
 from .tangent import Coordinates, choose_coordinates
@@ -86,15 +86,14 @@ def linearize(
     values = read_inputs(system.plan, dtype, {**by_entry(system.plan, at.inputs), **given})
     u = jnp.stack([_value_at(system, values, name, at.t) for name in names]) if names else at.x[:0]
     q = at.system.discrete_values.astype(at.x.dtype)
-    arguments = (system, at.t, at.x, q, values, u, tuple(names), tuple(quantity.tolist()), tuple(factor.tolist()))
+    point = Driven(at.t, at.x, q, values, u, tuple(names), tuple(outputs))
+    arguments = (system, point, tuple(quantity.tolist()), tuple(factor.tolist()))
     partials = partials_at(*arguments) if is_staged(arguments) else compiled_partials(*arguments)
     partials = _smooth(system, partials)
     coordinates = _coordinates(system, partials, states)
     if sampled:
-        point = Sampled(at.t, at.x, q, values, u, tuple(names), tuple(outputs))
         return sampled_space(system, point, partials, coordinates)
-    partials = _between_ticks(system, partials)
-    return _reduced(system, partials, at.x, u, coordinates, tuple(names), tuple(outputs))
+    return _reduced(system, point, _between_ticks(system, partials), coordinates)
 
 
 def _smooth(system: AcausalSystem, partials: Partials) -> Partials:
@@ -132,10 +131,7 @@ def _where(fine: Array, leaf: Array) -> Array:
     return jnp.where(fine, leaf, jnp.nan) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
 
 
-def _reduced(
-    system: AcausalSystem, partials: Partials, x: Array, u: Array, coordinates: Coordinates, names: tuple[str, ...],
-    outputs: tuple[str, ...],
-) -> StateSpace:  # fmt: skip
+def _reduced(system: AcausalSystem, point: Driven, partials: Partials, coordinates: Coordinates) -> StateSpace:
     """The state space on the tangent of the constraints. Inputs that hidden constraints contain would be
     differentiated; they have been refused before."""
     kept = coordinates.kept
@@ -143,8 +139,8 @@ def _reduced(
     follow, slopes = on_tangent(partials, coordinates)
     y_x, y_u, _ = partials.of_outputs
     return StateSpace(
-        slopes[kept], partials.of_slopes[1][kept], y_x @ follow, y_u, x[kept], u, partials.outputs,
-        partials.slopes[kept], states, names, outputs,
+        slopes[kept], partials.of_slopes[1][kept], y_x @ follow, y_u, point.x[kept], point.u, partials.outputs,
+        partials.slopes[kept], states, point.inputs, point.outputs,
     )  # fmt: skip
 
 

@@ -1,13 +1,13 @@
 """The partial derivatives of a model at a point, of which linear models are made."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..aliases import Args, Time
+from ..aliases import Args
 from ..lowering.plan import SystemPlan
 from ..programs.cache import compiled
 from ..system.nonlinear import Refinement
@@ -36,10 +36,21 @@ class Partials(NamedTuple):
     near: Array
 
 
-def partials_at(
-    system: AcausalSystem, t: Time, x: Array, q: Array, values: Args, u: Array, names: tuple[str, ...],
-    quantity: tuple[int, ...], factor: tuple[float, ...],
-) -> Partials:  # fmt: skip
+class Driven(NamedTuple):
+    """A point, what drives it there, and the names of inputs and outputs."""
+
+    t: Any
+    x: Array
+    q: Array
+    values: Args
+    u: Array
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+def partials_at(system: AcausalSystem, point: Driven, quantity: tuple[int, ...], factor: tuple[float, ...]) -> Partials:
+    """The partial derivatives of a system; `quantity` and `factor` are the outputs."""
+    t, x, q, values, u, names, _ = point
     n = len(system.plan.states)
     which, scale = np.array(quantity, np.int64), np.array(factor)
     events = resting_events(system.plan)

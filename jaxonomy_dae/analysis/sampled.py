@@ -7,7 +7,7 @@ Their product is the state space. (Franklin, Powell & Workman 1998, section 4.3.
 """
 
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,31 +16,19 @@ from jax import Array
 from jax.core import Tracer
 from jax.typing import DTypeLike
 
-from ..aliases import Args, PyTree
+from ..aliases import PyTree
 from ..diagnosis.wording import some
 from ..errors import ModelError
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from ..tolerances import KNOWN_ROUNDINGS, MEANT_EQUAL, spacing
 from .events_at_rest import RestingEvents, resting_events, ticked
-from .partials import Partials, on_tangent
+from .partials import Driven, Partials, on_tangent
 from .state_space import StateSpace
 from .tangent import Coordinates
 
 RATIO = 1000  # the largest denominator of a ratio of two periods that counts as one of integers
 TICKS = 1000  # in a period of all clocks: each instant is a matrix exponential
-
-
-class Sampled(NamedTuple):
-    """A point, what drives it there, and the names of inputs and outputs."""
-
-    t: Any
-    x: Array
-    q: Array
-    values: Args
-    u: Array
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
 
 
 class Instants(NamedTuple):
@@ -52,7 +40,7 @@ class Instants(NamedTuple):
     counts: dict[int, int]
 
 
-def sampled_space(system: AcausalSystem, point: Sampled, partials: Partials, coordinates: Coordinates) -> StateSpace:
+def sampled_space(system: AcausalSystem, point: Driven, partials: Partials, coordinates: Coordinates) -> StateSpace:
     """The discrete-time state space, of the states and the discrete variables that clocks write, before the first tick
     of a period."""
     plan, events = system.plan, resting_events(system.plan)

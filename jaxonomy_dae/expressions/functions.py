@@ -74,6 +74,10 @@ def _one_plus(c: int, u: Node) -> Node:
     return linear([(c, _squared(u))], 1)
 
 
+def _gaussian(u: Node) -> Node:
+    return apply("exp", scale(-1, _squared(u)))
+
+
 def _zero(*arguments: Node) -> tuple[Node, ...]:
     return (ZERO,) * len(arguments)
 
@@ -171,29 +175,13 @@ _rows = [
         lambda u: sympy.log(1 + sympy.exp(u)),
     ),
     _unary(
-        "sech",
-        _sech(np),
-        _sech(jnp),
-        lambda u: scale(-1, multiply(apply("tanh", u), apply("sech", u))),
-        sympy.sech,
+        "sech", _sech(np), _sech(jnp), lambda u: scale(-1, multiply(apply("tanh", u), apply("sech", u))), sympy.sech
     ),
     _unary("asinh", np.arcsinh, jnp.arcsinh, lambda u: power(_one_plus(1, u), -HALF), sympy.asinh),
     _unary("acosh", np.arccosh, jnp.arccosh, lambda u: power(linear([(1, _squared(u))], -1), -HALF), sympy.acosh, 2.0),
     _unary("atanh", np.arctanh, jnp.arctanh, lambda u: power(_one_plus(-1, u), -1), sympy.atanh, 0.0),
-    _unary(
-        "erf",
-        ssp.erf,
-        jsp.erf,
-        lambda u: scale(TWO_OVER_ROOT_PI, apply("exp", scale(-1, _squared(u)))),
-        sympy.erf,
-    ),
-    _unary(
-        "erfc",
-        ssp.erfc,
-        jsp.erfc,
-        lambda u: scale(-TWO_OVER_ROOT_PI, apply("exp", scale(-1, _squared(u)))),
-        sympy.erfc,
-    ),
+    _unary("erf", ssp.erf, jsp.erf, lambda u: scale(TWO_OVER_ROOT_PI, _gaussian(u)), sympy.erf),
+    _unary("erfc", ssp.erfc, jsp.erfc, lambda u: scale(-TWO_OVER_ROOT_PI, _gaussian(u)), sympy.erfc),
     _unary(
         "erfinv",
         ssp.erfinv,
@@ -202,14 +190,7 @@ _rows = [
         sympy.erfinv,
         0.0,
     ),
-    _unary(
-        "gamma",
-        ssp.gamma,
-        jsp.gamma,
-        lambda u: multiply(apply("gamma", u), polygamma(0, u)),
-        sympy.gamma,
-        1.0,
-    ),
+    _unary("gamma", ssp.gamma, jsp.gamma, lambda u: multiply(apply("gamma", u), polygamma(0, u)), sympy.gamma, 1.0),
     _unary(
         "loggamma",
         _log_gamma(ssp.gammaln, np),
@@ -253,12 +234,7 @@ _rows = [
         (1.0, 1.0),
     ),
     Function(
-        "mod",
-        np.mod,
-        jnp.mod,
-        lambda a, b: (ONE, scale(-1, apply("floor", divide(a, b)))),
-        sympy.Mod,
-        (None, 1.0),
+        "mod", np.mod, jnp.mod, lambda a, b: (ONE, scale(-1, apply("floor", divide(a, b)))), sympy.Mod, (None, 1.0)
     ),
 ]
 

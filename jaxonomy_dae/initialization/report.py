@@ -137,12 +137,10 @@ class InitializationReport(Sections):
         rows = self._rows
         if not rows.redundant:
             return []
-        place = {id(r): k for k, r in enumerate(rows.kept)}
         position = {(r.name, r.given): k for k, r in enumerate(rows.kept)}
 
         def value(row: StartRow) -> tuple[str, float]:
-            k = place.get(id(row), position[row.name, row.given])
-            return row.name, float(self._target[k])
+            return row.name, float(self._target[position[row.name, row.given]])
 
         out = []
         first = len(self._residual) - len(rows.kept)

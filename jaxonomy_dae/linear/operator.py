@@ -92,6 +92,15 @@ def _(operator: SparseLinearOperator) -> bool:
     return any(tag in operator.tags for tag in known)
 
 
+# What is not seen from the pattern is what the tags say.
+for _asked, _tag in (
+    (lx.has_unit_diagonal, lx.unit_diagonal_tag),
+    (lx.is_positive_semidefinite, lx.positive_semidefinite_tag),
+    (lx.is_negative_semidefinite, lx.negative_semidefinite_tag),
+):
+    _asked.register(SparseLinearOperator)(lambda operator, tag=_tag: tag in operator.tags)
+
+
 @lx.is_diagonal.register(SparseLinearOperator)
 def _(operator: SparseLinearOperator) -> bool:
     return lx.diagonal_tag in operator.tags or _lies(operator, 0, 0)
@@ -110,21 +119,6 @@ def _(operator: SparseLinearOperator) -> bool:
 @lx.is_upper_triangular.register(SparseLinearOperator)
 def _(operator: SparseLinearOperator) -> bool:
     return lx.upper_triangular_tag in operator.tags or _lies(operator, 0, operator.pattern.n)
-
-
-@lx.has_unit_diagonal.register(SparseLinearOperator)
-def _(operator: SparseLinearOperator) -> bool:
-    return lx.unit_diagonal_tag in operator.tags
-
-
-@lx.is_positive_semidefinite.register(SparseLinearOperator)
-def _(operator: SparseLinearOperator) -> bool:
-    return lx.positive_semidefinite_tag in operator.tags
-
-
-@lx.is_negative_semidefinite.register(SparseLinearOperator)
-def _(operator: SparseLinearOperator) -> bool:
-    return lx.negative_semidefinite_tag in operator.tags
 
 
 @lx.conj.register(SparseLinearOperator)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import lineax as lx
 import numpy as np
+from jaxtyping import Bool
 
 from ..compiler.order_blocks import Blocks
 from ..compiler.select_states import StateSelection
@@ -38,16 +39,18 @@ class DummyBlocks(NamedTuple):
     columns: np.ndarray
 
 
-def dummy_blocks(steps: Sequence[AnyStep], dummies: np.ndarray) -> tuple[DummyBlocks, ...]:
-    """The nonlinear blocks that determine `dummies`, quantities that a minimal set of states leaves out."""
+def nonlinear_blocks(
+    steps: Sequence[AnyStep], holds: Callable[[AnyStep], Bool[np.ndarray, " unknowns"]]
+) -> tuple[DummyBlocks, ...]:
+    """The nonlinear blocks with an unknown for which `holds` is true, over all unknowns of a step."""
     found: list[DummyBlocks] = []
     start = 0
     for step in steps:
         if not step.carried:
             continue
-        holds = np.isin(np.concatenate(step.unknown), dummies)
-        if holds.any():
-            found.extend(DummyBlocks(start + rows, start + columns) for rows, columns in step.blocks_of(holds))
+        chosen = holds(step)
+        if chosen.any():
+            found.extend(DummyBlocks(start + rows, start + columns) for rows, columns in step.blocks_of(chosen))
         start += sum(len(quantities) for quantities in step.guessed)
     return tuple(found)
 
@@ -210,19 +213,13 @@ class SystemPlan:
     @functools.cached_property
     def written_blocks(self) -> tuple[DummyBlocks, ...]:
         """All nonlinear blocks that are written out, not factorised as one sparse system."""
-        steps = [step for step in self.steps if step.carried]
-        starts = np.cumsum([0, *(sum(len(quantities) for quantities in step.guessed) for step in steps)])
-        return tuple(
-            DummyBlocks(start + rows, start + columns)
-            for start, step in zip(starts.tolist(), steps, strict=False)
-            if not step.whole
-            for rows, columns in step.blocks_of(np.ones(sum(map(len, step.unknown)), bool))
-        )
+        return nonlinear_blocks(self.steps, lambda step: np.full(sum(map(len, step.unknown)), not step.whole))
 
     @functools.cached_property
     def dummy_blocks(self) -> tuple[DummyBlocks, ...]:
         """The nonlinear blocks whose unknowns were dropped from the candidates for states."""
-        return dummy_blocks(self.steps, self.selection.dummies) if len(self.carried) else ()
+        dummies = self.selection.dummies
+        return nonlinear_blocks(self.steps, lambda step: np.isin(np.concatenate(step.unknown), dummies))
 
     def reading(self, quantities: np.ndarray) -> Program:
         """The program that computes these quantities and nothing else."""

@@ -156,12 +156,18 @@ class Parameters(eqx.Module):
     @property
     def known(self) -> Float[np.ndarray, " n"] | None:
         """All values of one system, outside jit; None of a batch, and of what holds only some of them."""
+        return None if self.batch else self._as_given()
+
+    def _as_given(self) -> Float[np.ndarray, "*batch n"] | None:
+        """All values as they are given, not as they are read, outside jit; None of what holds only some of them."""
         parts = [self.values, self.free] if self.free_index else [self.values]
-        if self.batch or not all(_is_array(part) and not isinstance(part, Tracer) for part in parts):
+        if not all(_is_array(part) and not isinstance(part, Tracer) for part in parts):
             return None
         values = np.array(self.values)
         if self.free_index:
-            values[list(self.free_index)] = self.free
+            free = np.asarray(self.free)
+            values = np.array(np.broadcast_to(values, (*free.shape[:-1], values.shape[-1])))
+            values[..., list(self.free_index)] = free
         return self.table.complete(values)
 
     @property
@@ -273,15 +279,9 @@ class Parameters(eqx.Module):
     def problem(self) -> str | None:
         """The first parameter that is not finite or out of its bounds, in words; None if all are right, and of values
         that are not known."""
-        parts = [self.values, self.free] if self.free_index else [self.values]
-        if not all(_is_array(part) and not isinstance(part, Tracer) for part in parts):
+        values = self._as_given()
+        if values is None:
             return None
-        values = np.array(self.values)
-        if self.free_index:  # as they are given, not as they are read
-            free = np.asarray(parts[1], float)
-            values = np.array(np.broadcast_to(values, (*free.shape[:-1], values.shape[-1])))
-            values[..., list(self.free_index)] = free
-        values = self.table.complete(values)
         right = self.table.ends.admit(values)
         if right.all():
             return None

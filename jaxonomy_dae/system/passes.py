@@ -8,6 +8,7 @@ import numpy as np
 from ..compiler.added_passes import PassResult
 from ..diagnosis.wording import counted
 from ..lowering.plan import SystemPlan
+from ..lowering.schedule import AnyStep
 from ..model.tables import ZERO, provenance_of
 from .sections import HTML_SHOWN, SHOWN, Sections, folded, some
 
@@ -153,20 +154,23 @@ class Passes(Sections):
             yield f"{some(unknowns)}{together} ← {some([f'({text})' for text in equations])}"
 
     def _scheduled(self) -> list[str]:
-        plan = self._plan
-        out, single = [], 0
-        for step in plan.steps:
-            if not step.simultaneous:
-                single += step.n
-                continue
-            how = "linear" if step.linear else "nonlinear, its tearing variables refined by Newton's method"
-            for count, unknown, torn in step.listed():
-                times = f"{count} × " if count > 1 else ""
-                names, torn_names = ([plan.quantity_name[q] for q in which.tolist()] for which in (unknown, torn))
-                solved = "solved whole, sparse" if step.whole else f"torn at {some(torn_names)}"
-                out.append(f"{times}{counted(len(names), 'unknown')} ({some(names)}): {how}; {solved}")
+        single = sum(step.n for step in self._plan.steps if not step.simultaneous)
+        kinds = {True: "linear", False: "nonlinear, its tearing variables refined by Newton's method"}
         head = [f"{counted(single, 'equation')} solved for one unknown each, in closed form"] if single else []
-        return head + out
+        return head + [
+            f"{times}{counted(len(names), 'unknown')} ({some(names)}): {kinds[step.linear]}; {how}"
+            for step, times, names, how in simultaneous_blocks(self._plan)
+        ]
+
+
+def simultaneous_blocks(plan: SystemPlan) -> Iterator[tuple[AnyStep, str, list[str], str]]:
+    """The blocks that take more than one division, alike ones once: (the step, how many in words, the names of the
+    unknowns, how the block is solved)."""
+    for step in plan.steps:
+        for count, unknown, torn in step.listed() if step.simultaneous else ():
+            names, torn_names = ([plan.quantity_name[q] for q in which.tolist()] for which in (unknown, torn))
+            how = "solved whole, sparse" if step.whole else f"torn at {some(torn_names)}"
+            yield step, f"{count} × " if count > 1 else "", names, how
 
 
 def selection_rule(mode: str) -> str:

@@ -13,6 +13,7 @@ from ..model.symbolic import SymbolicTemplate, number_label, parameter_label
 from ..model.tables import FlatModel, provenance_of
 from ..modeling.events import EventFlag
 from ..structure.pantelides import Offsets, reduce_index
+from .passes import simultaneous_blocks
 from .sections import Sections, folded, some
 from .solver_choice import solver_choice
 
@@ -102,16 +103,11 @@ class SystemReport(Sections):
     @property
     def blocks(self) -> list[str]:
         """The simultaneous blocks, alike ones counted together."""
-        plan = self._plan
-        out = []
-        for step in plan.steps:
-            kind = "linear" if step.linear else "nonlinear"
-            for count, unknown, torn in step.listed() if step.simultaneous else ():
-                times = f"{count} × " if count > 1 else ""
-                names, torn = ([plan.quantity_name[q] for q in chosen.tolist()] for chosen in (unknown, torn))
-                how = "solved whole, sparse" if step.whole else f"torn at {some(torn)}"
-                out.append(f"{times}{kind} block of {len(names)}: {some(names)}; {how}")
-        return out
+        kinds = {True: "linear", False: "nonlinear"}
+        return [
+            f"{times}{kinds[step.linear]} block of {len(names)}: {some(names)}; {how}"
+            for step, times, names, how in simultaneous_blocks(self._plan)
+        ]
 
     @property
     def discretes(self) -> list[str]:

@@ -378,18 +378,21 @@ class AcausalSystem(eqx.Module):
     def dummy_determinants(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
         """The determinants that vanish where the choice of states is singular: one for each nonlinear block that
         determines variables outside the minimal set. They are not differentiated."""
-        frozen, t, x, args = jax.tree.map(
-            lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, (self, t, x, args)
-        )
-        return jax.lax.stop_gradient(frozen.at(t, args).dummy_determinants(x))
+        here, x = self._still_at(t, x, args)
+        return jax.lax.stop_gradient(here.dummy_determinants(x))
 
     def block_determinants(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
         """The determinants of all nonlinear blocks that are solved by written-out elimination. They are not
         differentiated."""
+        here, x = self._still_at(t, x, args)
+        return jax.lax.stop_gradient(here.block_determinants(x))
+
+    def _still_at(self, t: Time, x: Float[Array, " n"], args: Any) -> tuple[SystemAt, Float[Array, " n"]]:
+        """The system at a time, and the state, not differentiated."""
         frozen, t, x, args = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, (self, t, x, args)
         )
-        return jax.lax.stop_gradient(frozen.at(t, args).block_determinants(x))
+        return frozen.at(t, args), x
 
     @property
     def is_constrained(self) -> bool:
