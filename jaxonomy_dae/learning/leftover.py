@@ -151,7 +151,7 @@ class Leftover:
         return found
 
     @functools.cached_property
-    def _left(self) -> list[Float[np.ndarray, " f"]]:
+    def _left(self) -> list[Float[np.ndarray, " _"]]:
         """Of the power of noise at each frequency, the part that a fit leaves."""
         own = self.leverage / self.share[:, None]
         return [np.maximum(1 - periodogram(own[one.at].T).sum(axis=0), 0.0) for one in self.series]
@@ -198,14 +198,14 @@ def _neighbours(own: Float[np.ndarray, "s n"]) -> tuple[Float[np.ndarray, " s"],
     return n * (n + 2) * np.sum(terms, axis=0), lags
 
 
-def _peak(spectra: list[Float[np.ndarray, "s f"]]) -> Float[np.ndarray, " s"]:
+def _peak(spectra: list[Float[np.ndarray, "s _"]]) -> Float[np.ndarray, " s"]:
     """The probability of the highest peak of some spectra together: χ² at each frequency, times how many there are, of
     which neighbours depend on each other."""
     highest = np.max(sum(spectra), axis=1)
     return np.minimum(0.75 * spectra[0].shape[1] * chdtrc(2 * len(spectra), 2 * highest), 1.0)
 
 
-def _slow(spectra: list[Float[np.ndarray, "s f"]], left: list[Float[np.ndarray, " f"]]) -> Float[np.ndarray, " s"]:
+def _slow(spectra: list[Float[np.ndarray, "s _"]], left: list[Float[np.ndarray, " _"]]) -> Float[np.ndarray, " s"]:
     """The probability of the power at the lowest frequencies of all spectra together, up to a quarter of them."""
     chosen = [k for k, one in enumerate(spectra) if one.shape[1] >= SHORTEST * FINE]
     if not chosen:
