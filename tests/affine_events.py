@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxonomy_dae.adjoint.ends import ending
+from jaxonomy_dae.adjoint.late_times import Integration
 from jaxonomy_dae.hybrid.control import AtEvents
 from jaxonomy_dae.hybrid.facts import EventFacts
 from jaxonomy_dae.hybrid.problem import AbstractHybridProblem, HybridTerm
@@ -187,12 +188,12 @@ def run(numbers: Numbers, t1: Any, ts: Any, solver: Any, adjoint: Any) -> Ran:
     numbers = jax.tree.map(jnp.asarray, numbers)
     t0, t1 = jnp.zeros(()), jnp.asarray(t1)
     problem = Affine(numbers, 32.0 * jnp.finfo(t1.dtype).eps * t1)
-    done = integrate(
+    done = integrate(Integration(
         HybridTerm(problem), WithEvents(solver, MAX_EVENTS, MAX_EVENTS), t0, t1, 0.01 * t1,
         start(problem, t0, numbers.x, numbers.q, None, MAX_EVENTS, False), None,
         save=diffrax.SubSaveAt(ts=ts, fn=lambda t, y, args: (y.x, y.q)),
         controller=ending(diffrax.PIDController(rtol=1e-10, atol=1e-10), AtEvents()),
         adjoint=adjoint, max_steps=2000,
-    )  # fmt: skip
+    ))  # fmt: skip
     _, last = done.last
     return Ran(*done.ys, last.x, last.table.log[:, 0], last.count, done.result._value)

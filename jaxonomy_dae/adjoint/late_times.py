@@ -8,7 +8,7 @@ What a user's functions check stays where it is.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -42,27 +42,39 @@ def times_fit(t0: Time, t1: Time, ts: Times, controller: Controller) -> Bool[Arr
     return fits if traced else bool(fits)
 
 
-def diffeqsolve(
-    term: Terms, solver: Solver, t0: Time, t1: Time, dt0: Time, y0: State, args: Args, *,
-    save: diffrax.SubSaveAt, controller: Controller, adjoint: Any, **options: Any,
-) -> diffrax.Solution:  # fmt: skip
-    """`diffrax.diffeqsolve` without its checks of times, for an interval and times of one dtype.
+class Integration(NamedTuple):
+    """What is integrated, and by what, in Diffrax' terms. `save` says what is saved. The first step `dt0`, or None, is
+    positive where t0 < t1."""
 
-    **Arguments:** Diffrax', but: `save` says what is to be found in `ts["out"]` and `ys["out"]`; `ts["last"]` and
-    `ys["last"]` are the last accepted point. The first step `dt0`, or None, is positive where t0 < t1.
-    """
-    subs = {"last": diffrax.SubSaveAt(t1=True)}
-    if save.ts is None or missing(FOR_LATE_TIMES) is not None:
-        subs["out"] = save
+    term: Terms
+    solver: Solver
+    t0: Time
+    t1: Time
+    dt0: Time
+    y0: State
+    args: Args
+    save: diffrax.SubSaveAt
+    controller: Controller
+    adjoint: Any
+    max_steps: int
+
+
+def diffeqsolve(of: Integration, solver_state: bool, progress: diffrax.AbstractProgressMeter) -> diffrax.Solution:
+    """`diffrax.diffeqsolve` without its checks of times, for an interval and times of one dtype. What is saved is found
+    in `ts["out"]` and `ys["out"]`, the last accepted point in `ts["last"]` and `ys["last"]`."""
+    subs, controller, adjoint = {"last": diffrax.SubSaveAt(t1=True)}, of.controller, of.adjoint
+    if of.save.ts is None or missing(FOR_LATE_TIMES) is not None:
+        subs["out"] = of.save
     else:
-        adjoint = _LateTimes(adjoint, save, jnp.where(t0 < t1, 1, -1))  # pyright: ignore[reportCallIssue]
-    if dt0 is not None:
-        controller = ending(controller, FirstStep(dt0))
+        adjoint = _LateTimes(adjoint, of.save, jnp.where(of.t0 < of.t1, 1, -1))  # pyright: ignore[reportCallIssue]
+    if of.dt0 is not None:
+        controller = ending(controller, FirstStep(of.dt0))
     elif isinstance(controller, diffrax.StepTo):
         controller = _StepTo(controller)  # pyright: ignore[reportCallIssue]
     return diffrax.diffeqsolve(
-        term, solver, t0, t1, None, y0, args, stepsize_controller=controller, adjoint=adjoint,
-        saveat=diffrax.SaveAt(subs=subs, solver_state=options.pop("solver_state", False)), **options,
+        of.term, of.solver, of.t0, of.t1, None, of.y0, of.args, stepsize_controller=controller, adjoint=adjoint,
+        saveat=diffrax.SaveAt(subs=subs, solver_state=solver_state), max_steps=of.max_steps, throw=False,
+        progress_meter=progress,
     )  # fmt: skip
 
 

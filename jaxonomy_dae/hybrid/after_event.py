@@ -92,7 +92,7 @@ def aftermath(
         so before."""
         return is_zero(value, rate, arrival) & ((jnp.abs(rate) * ahead <= band) | rested)
 
-    outlook = _outlook(problem, t, x, q, instant, arrival, delay, ahead, is_flat, args)
+    outlook = _outlook(problem, (t, x, q, delay, args), instant, arrival, ahead, is_flat)
     written_q = jnp.where(outlook.flips, 1.0 - written_q, written_q) if problem.facts.choices else written_q
     slow = (jnp.abs(outlook.earlier - outlook.slope) <= STEADY * jnp.abs(outlook.slope)).astype(x.dtype)
     side, next_ones, caused, stuck = _sides(problem, instant, arrival, now, left, turns_back, outlook, is_flat)
@@ -100,11 +100,13 @@ def aftermath(
 
 
 def _outlook(
-    problem: AbstractHybridProblem, t: Time, x: Array, q: Array, instant: Instant, arrival: Arrival, delay: Time,
-    ahead: Time, is_flat: Callable[[Array, Array], Array], args: Args,
+    problem: AbstractHybridProblem, point: tuple[Time, Array, Array, Time, Args], instant: Instant, arrival: Arrival,
+    ahead: Time, is_flat: Callable[[Array, Array], Array],
 ) -> _Outlook:  # fmt: skip
-    """Evaluates slopes, guards and their rates at the four places, the last one only where a guard is flat. It does so
-    in a loop, for XLA compiles the equations as often as they are written."""
+    """Evaluates slopes, guards and their rates at the four places, the last one only where a guard is flat; `point` is
+    (t, x, q, delay of the event, args). It does so in a loop, for XLA compiles the equations as often as they are
+    written."""
+    t, x, q, delay, args = point
     g = problem.facts.n_guards
     sets, conditions = (
         jnp.asarray(sets_to_flip(problem.facts.choices, len(q))),

@@ -2,6 +2,7 @@
 number."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import jax
 import numpy as np
 
 from ..aliases import Numeric, PyTree
+from ..errors import SimulationError
 from .staging import layers
 
 SHOWN = 8  # members that a sentence lists
@@ -62,3 +64,16 @@ def failed_members(codes: Numeric, texts: Sequence[str]) -> str:
     if not found:
         return ""
     return f"under jax.vmap, {'; '.join(found)}"
+
+
+def say_of_members(
+    codes: Numeric, texts: Sequence[str], what: str, hint: str, throw: bool | None, stacklevel: int
+) -> None:
+    """Says which runs of a batch outside of jit failed (`what` they are): in an error if it is asked for, otherwise in
+    a warning, none if `throw` is False."""
+    found = "" if throw is False else failed_members(codes, texts)
+    text = f"{what} {found}. Their rows are not-a-number{hint}"
+    if found and throw:
+        raise SimulationError(text)
+    if found:
+        warnings.warn(text, RuntimeWarning, stacklevel=stacklevel + 1)

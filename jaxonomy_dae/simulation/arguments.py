@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from ..adjoint.resting import still
-from ..aliases import Inputs, Result, Time
+from ..aliases import Inputs, Result, Time, Times
 from ..errors import ModelError
 from ..initialization.initial_values import check_initial
 from ..solvers.solve_arguments import check_finite, check_longest_step
@@ -41,8 +41,8 @@ TEXT = (
 AHEAD = np.concatenate([[0.0], 10.0 ** np.linspace(-15, 0, 64)])
 
 
-def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps):
-    """Raises a `ModelError` that says which argument cannot work, and what would."""
+def check_system(system: Any) -> None:
+    """Raises a `ModelError` for anything but one system."""
     if not isinstance(system, AcausalSystem):
         raise ModelError(f"simulate needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
     if system.parameters.values.ndim != 1:
@@ -50,6 +50,11 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
             f"the system is a batch, its parameters have shape {system.parameters.values.shape}: simulate each with "
             "equinox.filter_vmap(lambda s: simulate(s, ...))(system)"
         )
+    _note_single_precision(system)
+
+
+def check_method(system: AcausalSystem, solver: Any, adjoint: Any, stepsize_controller: Any) -> None:
+    """Raises a `ModelError` for a solver, an adjoint or a controller that cannot work, and says what would."""
     if solver is not None and not isinstance(solver, diffrax.AbstractSolver):
         if isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver):
             got = f"the class {solver.__name__}: write {solver.__name__}()"
@@ -62,14 +67,6 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
             "its constraints and leaves the algebraic variables out. Use the default StoredAdjoint(), "
             "RecursiveCheckpointAdjoint(), or ForwardMode() for few parameters"
         )
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-        raise ModelError(f"max_steps must be a positive integer; got {_told(max_steps)}")
-    room = (max_steps + 1) * system.plan.n_state * system.parameters.values.dtype.itemsize
-    if ts is None and room > MOST_ROOM:
-        raise ModelError(
-            f"saving every step (ts=None) reserves max_steps + 1 = {max_steps + 1} rows for {system.plan.n_state} "
-            f"states, {room / 2**30:.1f} GiB: say when to save, ts=jnp.linspace(t0, t1, 101), or lower max_steps"
-        )
     if isinstance(stepsize_controller, diffrax.ConstantStepSize):
         raise ModelError(
             "stepsize_controller=ConstantStepSize() needs a step: use diffrax.StepTo(ts=jnp.linspace(t0, t1, n))"
@@ -79,8 +76,23 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
             "stepsize_controller=StepTo(...) prescribes where steps end, but this model has events, at which they must "
             "end too: leave it out, or bound the steps with dtmax="
         )
-    _note_single_precision(system)
+
+
+def check_steps(system: AcausalSystem, ts: Times, dtmax: Time, max_steps: Any) -> None:
+    """Raises a `ModelError` for steps that are too many to be saved, and limits that are no numbers."""
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+        raise ModelError(f"max_steps must be a positive integer; got {_told(max_steps)}")
+    room = (max_steps + 1) * system.plan.n_state * system.parameters.values.dtype.itemsize
+    if ts is None and room > MOST_ROOM:
+        raise ModelError(
+            f"saving every step (ts=None) reserves max_steps + 1 = {max_steps + 1} rows for {system.plan.n_state} "
+            f"states, {room / 2**30:.1f} GiB: say when to save, ts=jnp.linspace(t0, t1, 101), or lower max_steps"
+        )
     check_longest_step(dtmax)
+
+
+def check_start(system: AcausalSystem, t0: Time, t1: Time, ts: Times, initial: Any) -> None:
+    """Raises a `ModelError` for an interval, times and a start that cannot be."""
     if isinstance(initial, SavedState):
         check_saved_state(system, t0, initial)
     elif hasattr(initial, "ndim"):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..aliases import Inputs, Result, State, Time, Tolerance
+from ..aliases import Inputs, Result, State, Time
 from ..diagnosis.lost_cancellation import lost_cancellation
 from ..diagnosis.wording import listed, quoted
 from ..errors import SimulationError
@@ -16,10 +16,10 @@ from ..hybrid.solver import CLASH, MOVED, STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
 from ..model.events import Event
 from ..modeling.events import EventFlag
-from ..programs.members import failed_members, is_batched
+from ..programs.members import is_batched
 from ..programs.staging import is_traced, layers
 from ..solvers.choice_guard import SINGULAR_CHOICE
-from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
+from ..solvers.failures import SHOWN, Stopped, explain_failure, how_it_stopped
 from ..solvers.switching import STIFF
 from ..system.inputs import value_at
 from ..system.system import AcausalSystem
@@ -32,7 +32,6 @@ from .hybrid_problem import RESTART, resolution
 from .lost_constraints import lost_constraint
 from .preparation import term_of
 from .solution import Solution
-from .step_sizes import scaled_atol
 
 # A run that failed for another reason (steps too short, too many) is explained by a singular choice of states if a
 # determinant has fallen to this part of its first value.
@@ -52,21 +51,24 @@ OKAY: tuple[Result, Result] = (
 PROBES = 64  # times at which inputs are looked at
 
 
-def _codes(result: Result, has_events: bool, max_steps: int, max_events: int) -> tuple[Array, list[str]]:
+def codes(result: Result, has_events: bool, max_steps: int, max_events: int) -> tuple[Array, list[str]]:
     """A number for the reason by which a run failed, traced, 0 if it did not; and what the numbers from 1 on mean."""
-    codes = diffrax.RESULTS
+    of_diffrax = diffrax.RESULTS
     lost = "the equations have no solution there, or the start is not consistent"
     many = f"more than max_events={max_events} events" if has_events else "too many rejected steps"
     texts = [
-        (codes.max_steps_reached, f"max_steps={max_steps} was reached"),
-        (codes.dt_min_reached, "no step was short enough to be accepted"),
+        (of_diffrax.max_steps_reached, f"max_steps={max_steps} was reached"),
+        (of_diffrax.dt_min_reached, "no step was short enough to be accepted"),
         (TOO_MANY, many),
         (STUCK, "an event happens, or a relation turns, again and again at one instant"),
         (STIFF, f"the system is stiff, and max_steps={max_steps} hardly suffice: use solver=Rodas5P() or BDF()"),
         (CLASH, "two events give one variable different values at one instant"),
         (NOT_ADMITTED, TEXT),
         (SINGULAR_CHOICE, "the states have become a singular choice"),
-        (codes.nonlinear_divergence, f"{lost}, or an event wrote a value that is not finite" if has_events else lost),
+        (
+            of_diffrax.nonlinear_divergence,
+            f"{lost}, or an event wrote a value that is not finite" if has_events else lost,
+        ),
     ]
     number = sum(jnp.where(result == code, k, 0) for k, (code, _) in enumerate(texts, start=1))
     number = jnp.where(diffrax.is_okay(result), 0, jnp.where(number == 0, len(texts) + 1, number))
@@ -88,7 +90,7 @@ def raised(x: State, result: Result, has_events: bool, max_steps: int, max_event
     known = not is_traced(values) and not is_batched(result)  # under `jax.grad` outside of jit
     if known and is_code(values, *OKAY):
         return x
-    number, texts = _codes(values if known else result, has_events, max_steps, max_events)
+    number, texts = codes(values if known else result, has_events, max_steps, max_events)
     messages = [
         f"the integration stopped: {text}. simulate(...) outside jit, grad and vmap says where" for text in texts
     ]
@@ -97,42 +99,18 @@ def raised(x: State, result: Result, has_events: bool, max_steps: int, max_event
     return eqx.branched_error_if(x, number > 0, jnp.maximum(number - 1, 0), messages)
 
 
-def failed_in_batch(result: Result, has_events: bool, max_steps: int, max_events: int) -> str:
-    """The members of a batch outside of jit that failed, by number, and why; "" if none did."""
-    found = failed_members(*_codes(result, has_events, max_steps, max_events))
-    return (
-        f"runs that stopped {found}. Their rows are not-a-number; simulate(...) of one alone says where"
-        if found
-        else ""
-    )
-
-
-def explain(
-    solution: Solution,
-    first: tuple[State, State],
-    last: tuple[State, State],
-    t1: Time,
-    implicit: bool,
-    max_steps: int,
-    max_events: int,
-    rtol: Tolerance,
-    atol: Tolerance,
-) -> str:
-    """The reason, in a sentence, why the integration from `first` to t1 stopped at its last accepted point `last` = (t,
-    x), and the smallest mend."""
+def explain(solution: Solution, at: Stopped, x0: State, implicit: bool, max_events: int) -> str:
+    """The reason, in a sentence, why an integration from x0 on stopped, and the smallest mend."""
     system, inputs = solution.system, solution.inputs
-    (t0, _), (t, x) = first, last
-    log = solution.event_log
-    if log is not None and solution.result == TOO_MANY:
-        return _too_many_events(solution.events, max_events, float(t))
-    if log is not None and solution.result == STUCK:
-        return _stuck(solution, int(log.stuck), float(t), MOVED * float(resolution(t0, t1)))
-    if log is not None and solution.result == CLASH:
-        return _clash(solution, int(log.stuck), float(t))
-    if solution.result == STIFF:
+    t, x, first = at.t, at.y, (at.t0, x0)
+    stopped = f"the integration stopped at t={float(t):g}: "
+    of_event = _of_event(solution, at, max_events)
+    if of_event:
+        return of_event
+    if at.result == STIFF:
         return (
-            f"the integration stopped at t={float(t):.6g}: the system is stiff. From there on stability, not accuracy, "
-            f"limits explicit steps, so that max_steps={max_steps} hardly suffice to t={float(t1):g}. Write "
+            f"{stopped}the system is stiff. From there on stability, not accuracy, limits explicit steps, so that "
+            f"max_steps={at.max_steps} hardly suffice to t={float(at.t1):g}. Write "
             "solver=jaxonomy_dae.solvers.Rodas5P(), BDF() for many unknowns, or leave solver= out"
         )
     written, others = _not_finite(system, x)
@@ -140,7 +118,7 @@ def explain(
         return singular_mode(system, first, (t, x), inputs) + _of_short_circuits(system)
     written = written or others
     if written:
-        return f"the integration stopped at t={float(t):g}: an event gave {written} a value that is not finite" + (
+        return f"{stopped}an event gave {written} a value that is not finite" + (
             ", or it entered a mode whose constraint does not hold at that instant (its gap or speed is not zero), or "
             "which no impulse can enforce. Check the event's condition, or reset the states with reinit(...)"
             if system.plan.held is not None
@@ -149,39 +127,42 @@ def explain(
             if system.is_constrained
             else ""
         )
-    bad = _bad_input(system.plan, inputs, float(t0), float(t), float(t1))
+    bad = _bad_input(system.plan, inputs, float(at.t0), float(t), float(at.t1))
     if bad:
-        return f"the integration stopped at t={float(t):g}: {bad}"
+        return stopped + bad
     plan, numbers = system.plan, np.asarray(system.numbers, float)
     lost = lost_cancellation(plan.model.groups, numbers, plan.flat.parameters.names, float(t))
     if lost:
-        return f"the integration stopped at t={float(t):g}: {lost}."
+        return f"{stopped}{lost}."
     equation = equation_not_finite(system, inputs, t, x)
     if equation is not None:
-        where, mend = ("at the start", "Start elsewhere, or look") if float(t) == float(t0) else ("there", "Look")
+        where, mend = ("at the start", "Start elsewhere, or look") if float(t) == float(at.t0) else ("there", "Look")
         return (
-            f"the integration stopped at t={float(t):g}: an equation is not finite {where}, "
-            f"{equation.text(system)}. {mend} for a "
-            "division by zero, or a root or logarithm without a real value."
+            f"{stopped}an equation is not finite {where}, {equation.text(system)}. {mend} for a division by zero, or a "
+            "root or logarithm without a real value."
         )
-    singular = _singular_choice(solution, first, t, x)
-    if singular:
-        return f"{singular}."
-    found = lost_constraint(system, inputs, t, x, t1)
+    found = _singular_choice(solution, first, t, x) or lost_constraint(system, inputs, t, x, at.t1)
     if found:
-        return f"the integration stopped at t={float(t):g}: {found}."
-    block = failed_block(system, first, last, t1, inputs)
+        return f"{stopped}{found}."
+    block = failed_block(system, first, (t, x), at.t1, inputs)
     if block:
-        return how_it_stopped(solution.result, t, max_steps) + block
-    domain = end_of_domain(system, t, x, t1, inputs)
+        return how_it_stopped(at.result, t, at.max_steps) + block
+    domain = end_of_domain(system, t, x, at.t1, inputs)
     if domain:
-        return f"the integration stopped at t={float(t):g}: {domain}."
-    names = [*system.states, *system.carried]
-    return explain_failure(
-        term_of(system, implicit), inputs, t, x, names,
-        result=solution.result, t0=t0, t1=t1, max_steps=max_steps, rtol=rtol, atol=scaled_atol(system, atol),
-        explicit=not implicit,
-    )  # fmt: skip
+        return f"{stopped}{domain}."
+    return explain_failure(term_of(system, implicit), inputs, [*system.states, *system.carried], at, not implicit)
+
+
+def _of_event(solution: Solution, at: Stopped, max_events: int) -> str:
+    """Says which events ended the run; "" if none did."""
+    log, t = solution.event_log, float(at.t)
+    if log is None:
+        return ""
+    if at.result == TOO_MANY:
+        return _too_many_events(solution.events, max_events, t)
+    if at.result == STUCK:
+        return _stuck(solution, int(log.stuck), t, MOVED * float(resolution(at.t0, at.t1)))
+    return _clash(solution, int(log.stuck), t) if at.result == CLASH else ""
 
 
 def mode_at_start(system: AcausalSystem, inputs: Inputs, t0: Time, x0: State) -> str:
@@ -372,7 +353,7 @@ def _singular_choice(solution: Solution, first: tuple[State, State], t: Time, x:
     values = np.asarray(x)[len(plan.states) + lost]
     shown = ", ".join(f"'{system.carried[c]}' = {v:.3g}" for c, v in list(zip(lost, values, strict=True))[:SHOWN])
     return (
-        f"the integration stopped at t={float(t):.6g}: the states {quoted(system.states, SHOWN)} have become a "
+        f"the states {quoted(system.states, SHOWN)} have become a "
         f"singular choice. There they no longer determine {shown}, and it cannot be told which branch continues. "
         'Compile with state_selection="auto", which has no such points, or with other prefer_states'
     )

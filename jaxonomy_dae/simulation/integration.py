@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..adjoint.ends import ending
+from ..adjoint.late_times import Integration
 from ..aliases import Args, Controller, Inputs, PyTree, Result, Solver, State, Terms, Time, Times
 from ..hybrid.control import ENDED, AtEvents
 from ..hybrid.problem import HybridState, HybridTerm
@@ -147,12 +148,12 @@ def run(
     begin = _started(given, checked, begun)
     parts = _parts(given, options, watch, begin)
     ts, fn = given.ts, parts.saved
-    done = integrate(
-        parts.term, parts.solver, given.t0, given.t1, parts.dt0, parts.y0, given.inputs,
-        save=diffrax.SubSaveAt(t0=True, steps=True, fn=fn) if ts is None else diffrax.SubSaveAt(ts=ts, fn=fn),
-        controller=parts.controller, adjoint=options.adjoint, max_steps=options.max_steps,
-        progress=options.progress, checked=checked, goes_on=parts.goes_on,
+    save = diffrax.SubSaveAt(t0=True, steps=True, fn=fn) if ts is None else diffrax.SubSaveAt(ts=ts, fn=fn)
+    integration = Integration(
+        parts.term, parts.solver, given.t0, given.t1, parts.dt0, parts.y0, given.inputs, save, parts.controller,
+        options.adjoint, options.max_steps,
     )  # fmt: skip
+    done = integrate(integration, options.progress, checked, parts.goes_on)
     rows = _rows(given, begin, parts, done)
     consistent = parts.consistent & parts.admitted
     # What is not a number here has derivatives that are not, so that a loss over failed rows cannot seem to have a

@@ -1,7 +1,6 @@
 """`simulate`: a compiled system integrated by Diffrax."""
 
 import dataclasses
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,12 +18,13 @@ from ..initialization.check import check
 from ..initialization.initialize import InitialPoint, known_start, search_outside
 from ..initialization.ladder import Found
 from ..programs.cache import PROGRAMS
-from ..programs.members import batch_size, is_batched
+from ..programs.members import batch_size, is_batched, say_of_members
 from ..programs.rows import filled_up
 from ..programs.staging import as_array, is_forwards, is_staged, is_traced, on_device, picked
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
+from ..solvers.failures import Stopped
 from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
 from ..solvers.switching import BOUNDARY, MANY, SHARE, Watch
@@ -33,8 +33,8 @@ from ..system.inputs import StepEnds, check_range, read_inputs, step_ends
 from ..system.solver_choice import Choice, Stiffness, implicit_choice, solver_choice
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
-from .arguments import check_arguments, check_parameters, check_switches
-from .failures import OKAY, explain, failed_in_batch, is_code, mode_at_start, raised
+from .arguments import check_method, check_parameters, check_start, check_steps, check_switches, check_system
+from .failures import OKAY, codes, explain, is_code, mode_at_start, raised
 from .from_state import check_state
 from .integration import Given, Options, Outcome, run, run_compiled
 from .preparation import term_of
@@ -157,14 +157,17 @@ def simulate(
     - `ModelError` for arguments that cannot work; `InitializationError`; `SimulationError`. Inside jit, grad and vmap,
         with `throw=True`, errors that depend on values are Equinox run-time errors.
     """
-    if isinstance(system, AcausalSystem):  # `check_arguments` says what to do with anything else
+    if isinstance(system, AcausalSystem):  # `check_system` says what to do with anything else
         if initial is None or isinstance(initial, Mapping):
             initial = system.plan.one_by_one(initial)
     ts = ts if ts is None or hasattr(ts, "ndim") else as_array(ts)
     if isinstance(control, str):
         raise ModelError(f"control is a list of variables' names; write control=[{control!r}]")
     check_switches(max_events, save_events=save_events, progress=progress, throw=throw)
-    check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
+    check_system(system)
+    check_method(system, solver, adjoint, stepsize_controller)
+    check_steps(system, ts, dtmax, max_steps)
+    check_start(system, t0, t1, ts, initial)
     t0 = initial_time(t0, initial)
     dtype = system.parameters.values.dtype
     read = read_inputs(system.plan, dtype, inputs)
@@ -228,7 +231,7 @@ def _given(system: AcausalSystem, t0: Time, t1: Time, ts: Times, inputs: Args, i
     if ts is not None:
         ts = on_device(ts, dtype)
         if not is_traced((t0, t1, ts)):
-            # `check_arguments` lets rounding pass, Diffrax does not.
+            # `check_start` lets rounding pass, Diffrax does not.
             ts = on_device(np.clip(np.asarray(ts), t0, t1), dtype)
     # The solver is chosen by `simulate`, so that the programs of models that differ in how stiff they are are the same.
     return Given(dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
@@ -323,7 +326,7 @@ class _Call:
 
     def in_program(self, staged: bool) -> Solution:
         """The solution where values cannot be read."""
-        checked = self.throw is True
+        checked, has_events = self.throw is True, self.system.plan.events is not None
         if staged:
             PROGRAMS.make_room()
             outcome = run(self.given, self.options(), self.watch(True), checked, self.begun)
@@ -331,11 +334,11 @@ class _Call:
             checked = self.throw is not False
             outcome = run_compiled(self.given, self.options(), self.watch(True), begun=self.begun)
             if is_batched(outcome.result):
-                _say_of_members(outcome, self.system, self.bounds, self.throw)
+                hint = "; simulate(...) of one alone says where"
+                number, texts = codes(outcome.result, has_events, *self.bounds)
+                say_of_members(number, texts, "runs that stopped", hint, self.throw, stacklevel=5)
                 checked = False
-        x = outcome.x
-        if checked:
-            x = raised(x, outcome.result, self.system.plan.events is not None, *self.bounds)
+        x = raised(outcome.x, outcome.result, has_events, *self.bounds) if checked else outcome.x
         return self._solution(outcome, outcome.stats, (outcome.ts, x, outcome.discrete), outcome.memory)
 
     def outside(self) -> Solution:
@@ -406,9 +409,9 @@ class _Call:
             return InitializationError(mode)
         if outcome.held is not None:
             solution = eqx.tree_at(lambda s: s.system, solution, system.holding(outcome.held))
-        implicit, (steps, events) = is_implicit(self.run_by), self.bounds
-        text = explain(solution, first, outcome.last, given.t1, implicit, steps, events, self.rtol, self.atol)
-        return SimulationError(text)
+        (t, x), (steps, events) = outcome.last, self.bounds
+        stopped = Stopped(t, x, outcome.result, given.t0, given.t1, steps, self.rtol, scaled_atol(system, self.atol))
+        return SimulationError(explain(solution, stopped, outcome.found.x, is_implicit(self.run_by), events))
 
 
 def _expected_events(system: AcausalSystem, duration: float) -> float:
@@ -433,12 +436,3 @@ def _stiff_without_a_run(stiffness: Stiffness | None, duration: float | None) ->
     if stiffness is None or duration is None or stiffness.decay * duration <= BOUNDARY * MANY:
         return ""
     return f"stiff: at the declared start something decays within about {1 / stiffness.decay:.0e}"
-
-
-def _say_of_members(outcome: Outcome, system: AcausalSystem, bounds: tuple[int, int], throw: bool | None) -> None:
-    """Says which members of a batch failed, outside of jit: in a warning, or in an error if it is asked for."""
-    text = "" if throw is False else failed_in_batch(outcome.result, system.plan.events is not None, *bounds)
-    if text and throw:
-        raise SimulationError(text)
-    if text:
-        warnings.warn(text, RuntimeWarning, stacklevel=6)

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from ..adjoint.ends import Ending
-from ..adjoint.late_times import diffeqsolve, times_fit
+from ..adjoint.late_times import Integration, diffeqsolve, times_fit
 from ..adjoint.resting import HeldBack, Resting
 from ..adjoint.stored_adjoint import StoredAdjoint
-from ..aliases import Args, Controller, Numeric, PyTree, Result, Solver, State, Terms, Time, Times
+from ..aliases import Numeric, PyTree, Result, Solver, State, Times
 from .bdf import BDF
 from .projected import Projected
 from .rodas5p import Rodas5P
@@ -57,39 +57,21 @@ def is_multistep(solver: Solver) -> bool:
     return isinstance(inner(solver), BDF)
 
 
-def integrate(
-    term: Terms,
-    solver: Solver,
-    t0: Time,
-    t1: Time,
-    dt0: Time,
-    y0: State,
-    args: Args,
-    *,
-    save: diffrax.SubSaveAt,
-    controller: Controller,
-    adjoint: diffrax.AbstractAdjoint,
-    max_steps: int,
-    progress: bool = False,
-    checked: bool = False,
-    goes_on: Numeric = True,
-) -> Run:
+def integrate(of: Integration, progress: bool = False, checked: bool = False, goes_on: Numeric = True) -> Run:
     """Integrates; returns the values asked for, the last accepted point, and counts, Jacobians included."""
+    term, solver, controller, t0, t1 = of.term, of.solver, of.controller, of.t0, of.t1
     # `StoredAdjoint` holds steps back by itself, where it is differentiated.
-    if not isinstance(adjoint, StoredAdjoint) and Resting.of(term, solver, controller, y0, args, t1 - t0):
+    if not isinstance(of.adjoint, StoredAdjoint) and Resting.of(term, solver, controller, of.y0, of.args, t1 - t0):
         controller = Ending(controller, (HeldBack(term, solver, controller),))  # pyright: ignore[reportCallIssue]
-    fits = times_fit(t0, t1, save.ts, controller)
+    fits = times_fit(t0, t1, of.save.ts, controller)
     if checked and fits is not True:
         t1 = eqx.error_if(t1, jnp.logical_not(fits), TIMES)
     counted = isinstance(solver, BDF)
     # An interval of length zero: the loop over the steps ends before the first one.
     if goes_on is not True:
         t1 = jnp.where(goes_on, t1, t0)
-    solved: Any = diffeqsolve(
-        term, solver, t0, t1, dt0, y0, args, save=save, controller=controller, adjoint=adjoint, max_steps=max_steps,
-        throw=False, solver_state=counted,
-        progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
-    )  # fmt: skip
+    meter = diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter()
+    solved: Any = diffeqsolve(of._replace(t1=t1, controller=controller), counted, meter)
     stats = dict(solved.stats)
     if counted:
         state = solved.solver_state

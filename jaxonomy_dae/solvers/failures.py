@@ -1,7 +1,7 @@
 """What is wrong with a start, and why an integration stopped: found once, said by name."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -127,20 +127,29 @@ def how_it_stopped(result: Result, t: Time, max_steps: int) -> str:
     return f"the integration stopped at t={float(t):g}: {reason}. "
 
 
-def explain_failure(
-    term: Terms, args: Args, t: Time, y: State, names: Sequence[str], *,
-    result: Result, t0: Time, t1: Time, max_steps: int, rtol: Tolerance, atol: Tolerance, explicit: bool = False,
-) -> str:  # fmt: skip
-    """The reason, in a sentence, why an integration stopped at the last accepted point (t, y), and what to write
-    instead."""
-    problem = FlatProblem(term, y, args)
-    flat, time = problem.flat, jnp.asarray(t)
-    many = result == diffrax.RESULTS.max_steps_reached
-    start = how_it_stopped(result, t, max_steps)
+class Stopped(NamedTuple):
+    """An integration from t0 to t1 that stopped at its last accepted point (t, y)."""
+
+    t: Time
+    y: State
+    result: Result
+    t0: Time
+    t1: Time
+    max_steps: int
+    rtol: Tolerance
+    atol: Tolerance
+
+
+def explain_failure(term: Terms, args: Args, names: Sequence[str], at: Stopped, explicit: bool = False) -> str:
+    """The reason, in a sentence, why an integration stopped, and what to write instead."""
+    problem = FlatProblem(term, at.y, args)
+    t, flat, time = at.t, problem.flat, jnp.asarray(at.t)
+    many = at.result == diffrax.RESULTS.max_steps_reached
+    start = how_it_stopped(at.result, t, at.max_steps)
     right = np.asarray(problem.right(time, flat))
     if not np.isfinite(right).all():
         value = right[~np.isfinite(right)][0]
-        where = "at the start. Start elsewhere, or look" if float(t) == float(t0) else "there. Look"
+        where = "at the start. Start elsewhere, or look" if float(t) == float(at.t0) else "there. Look"
         return start + (
             f"The equations are not finite: {first_bad_row(problem, right, names)} is {value} {where} for a division "
             "by zero, or a root or logarithm without a value."
@@ -153,16 +162,16 @@ def explain_failure(
                 f"Newton's matrix is singular there: the equations do not determine {found} (a bifurcation, or an "
                 "index above 1)."
             )
-    weight = np.asarray(rtol * jnp.abs(flat) + _flat(atol, flat))
-    cause = cause_of(problem, time, flat, jnp.asarray(t1), weight, names, max_steps, explicit)
+    weight = np.asarray(at.rtol * jnp.abs(flat) + _flat(at.atol, flat))
+    cause = cause_of(problem, time, flat, jnp.asarray(at.t1), weight, names, at.max_steps, explicit)
     if cause:
         return f"{start}{cause}."
     slope = np.abs(np.asarray(consistent_slope(problem, None, time, flat))) / weight
     worst = [k for k in np.argsort(-np.where(np.isfinite(slope), slope, np.inf))[:SHOWN] if not slope[k] == 0]
     fastest = ", ".join(f"'{names[k]}' = {float(flat[k]):.6g}" for k in worst)
     mend = (
-        f"Raise max_steps, loosen rtol={float(rtol):g} and atol, or look for a jump or a pole: jump_ts= names times of "
-        "jumps"
+        f"Raise max_steps, loosen rtol={float(at.rtol):g} and atol, or look for a jump or a pole: jump_ts= names times "
+        "of jumps"
         if many
         else "Look for a pole, a turning point, a jump (jump_ts= names their times), or a root or logarithm without a "
         "value just beyond"

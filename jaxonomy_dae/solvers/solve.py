@@ -1,30 +1,31 @@
 """`solve_dae`: a differential-algebraic equation of the user's own, solved and checked."""
 
 import math
-import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jax.typing import DTypeLike
 
+from ..adjoint.late_times import Integration
 from ..adjoint.stored_adjoint import default_adjoint
-from ..aliases import Args, PyTree, Result, Solver, State, Time, Times, Tolerance
+from ..aliases import Args, Controller, PyTree, Result, Solver, State, Time, Times, Tolerance
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..programs.cache import PROGRAMS, compiled
-from ..programs.members import failed_members, is_batched
+from ..programs.members import is_batched, say_of_members
 from ..programs.platform import precisely
 from ..programs.staging import as_array, is_forwards, is_staged, is_traced
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
 from .drive import integrate, is_multistep, right_between_steps
-from .failures import SHOWN, StartCheck, explain_failure, explain_start, start_check
+from .failures import SHOWN, StartCheck, Stopped, explain_failure, explain_start, start_check
 from .index_one import consistent_point, consistent_shift
 from .rodas5p import Rodas5P
 from .rows import not_a_number
@@ -117,19 +118,20 @@ def solve_dae(
     ts = None if ts is None else jnp.asarray(ts, dtype)
     if adjoint is None:
         adjoint = default_adjoint(is_forwards((term, t0, t1, y0, ts, args)))
-    options = (solver, adjoint, stepsize_controller, max_steps)
-    arguments = (term, t0, t1, y0, ts, args, (rtol, atol), options)
-    staged = is_staged(arguments)
+    of = _Given(term, t0, t1, y0, ts, args, (rtol, atol), solver, adjoint, stepsize_controller, max_steps)
+    staged = is_staged(of)
     if staged:
         PROGRAMS.make_room()
-        check, solution, last = _solve(*arguments, checked=throw is True)
+        check, solution, last = _solve(of, checked=throw is True)
     else:
-        check, solution, last = _compiled(*arguments)
+        check, solution, last = _compiled(of)
     known = list(names) if names is not None else [f"y[{k}]" for k in range(n)]
     outcome = (check, solution.result)
     if is_traced(outcome):
         if is_batched(outcome) and not staged:
-            _say_of_members(check, solution.result, max_steps, throw)
+            say_of_members(
+                *_codes(check, solution.result, max_steps), "integrations that stopped", "", throw, stacklevel=3
+            )
         elif throw is True or throw is None and not staged:
             ys = check.error_if(solution.ys)
             solution = eqx.tree_at(lambda s: s.ys, solution, solution.result.error_if(ys, solution.result != OK))
@@ -139,32 +141,20 @@ def solve_dae(
         if message:
             raise InitializationError(message)
         if solution.result != OK:
-            text = explain_failure(
-                term, args, *last, known,
-                result=solution.result, t0=t0, t1=t1, max_steps=max_steps, rtol=rtol, atol=atol,
-            )  # fmt: skip
-            raise SimulationError(text)
+            stopped = Stopped(*last, solution.result, t0, t1, max_steps, rtol, atol)
+            raise SimulationError(explain_failure(term, args, known, stopped))
     return solution
 
 
-def _say_of_members(check: StartCheck, result: Result, max_steps: int, throw: bool | None) -> None:
-    """Says which members of a batch failed, outside of jit: in a warning, or in an error if it is asked for."""
+def _codes(check: StartCheck, result: Result, max_steps: int) -> tuple[Array, list[str]]:
+    """A number for the reason by which an integration failed, 0 if it did not; and what the numbers from 1 on mean."""
     codes = diffrax.RESULTS
     number = jnp.where(result == OK, 0, 4)
     number = jnp.where(result == codes.max_steps_reached, 1, number)
     number = jnp.where(result == codes.dt_min_reached, 2, number)
     number = jnp.where(check.is_fine, number, 3)
-    texts = [
-        f"max_steps={max_steps} was reached",
-        "no step was short enough to be accepted",
-        "the start is not consistent",
-        "it failed",
-    ]
-    text = "" if throw is False else failed_members(number, texts)
-    if text and throw:
-        raise SimulationError(f"integrations that stopped {text}")
-    if text:
-        warnings.warn(f"integrations that stopped {text}. Their rows are not-a-number", RuntimeWarning, stacklevel=4)
+    texts = [f"max_steps={max_steps} was reached", "no step was short enough to be accepted"]
+    return number, [*texts, "the start is not consistent", "it failed"]
 
 
 def _inexact(leaf: PyTree) -> PyTree:
@@ -229,16 +219,30 @@ def _rounded_up(value: float) -> float:
     return math.ceil(value / unit) * unit
 
 
+class _Given(NamedTuple):
+    """What `solve_dae` was given, as it was checked."""
+
+    term: Any
+    t0: Time
+    t1: Time
+    y0: State
+    ts: Times | None
+    args: Args
+    tolerances: tuple[Tolerance, Tolerance]
+    solver: Solver
+    adjoint: diffrax.AbstractAdjoint
+    controller: Controller
+    max_steps: int
+
+
 @precisely
-def _solve(term, t0, t1, y0, ts, args, tolerances, options, checked=False):
-    solver, adjoint, controller, max_steps = options
-    check: StartCheck = start_check(FlatProblem(term, y0, args), t0, *tolerances)
+def _solve(of: _Given, checked: bool = False):
+    term, t0, t1, y0, ts, args = of[:6]
+    check: StartCheck = start_check(FlatProblem(term, y0, args), t0, *of.tolerances)
     save = diffrax.SubSaveAt(t1=True) if ts is None else diffrax.SubSaveAt(ts=ts)
-    solver = solver if ts is None else right_between_steps(solver)
-    run = integrate(
-        term, solver, t0, t1, None, y0, args, save=save, controller=controller, adjoint=adjoint, max_steps=max_steps,
-        checked=checked,
-    )  # fmt: skip
+    solver = of.solver if ts is None else right_between_steps(of.solver)
+    integration = Integration(term, solver, t0, t1, None, y0, args, save, of.controller, of.adjoint, of.max_steps)
+    run = integrate(integration, checked=checked)
     reached = jnp.isfinite(run.ts) & check.is_fine
     saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
     saved = jax.tree.map(lambda y: not_a_number(y, reached, y0, args), saved)

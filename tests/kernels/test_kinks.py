@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from jaxonomy_dae.adjoint.ends import ending
+from jaxonomy_dae.adjoint.late_times import Integration
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.hybrid.control import AtEvents
 from jaxonomy_dae.hybrid.facts import EventFacts
@@ -63,12 +64,12 @@ def final(p, only_kinks):
     """(x at the end, the discrete value there), at rtol = atol = 1e-10."""
     problem = Stop(p, 1e-14, dataclasses.replace(FACTS, only_kinks=only_kinks))
     t0, t1 = jnp.zeros(()), jnp.asarray(END)
-    done = integrate(
+    done = integrate(Integration(
         HybridTerm(problem), WithEvents(diffrax.Tsit5(), 64), t0, t1, 0.1,
         start(problem, t0, jnp.array([0.0, 1.0]), jnp.zeros(1), None, 0, False), None,
         save=diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.x), adjoint=StoredAdjoint(), max_steps=1000,
         controller=ending(diffrax.PIDController(rtol=1e-10, atol=1e-10), AtEvents()),
-    )  # fmt: skip
+    ))  # fmt: skip
     return done.last[1].x[0], done.last[1].q[0]
 
 
