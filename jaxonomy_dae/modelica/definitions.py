@@ -6,22 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 from ..errors import ModelError
-from .tree import (
-    Assignment,
-    Branches,
-    Call,
-    Choice,
-    Class,
-    Effect,
-    Equality,
-    Expression,
-    Loop,
-    Reference,
-    Several,
-    Statement,
-    Truth,
-    each_part,
-)
+from . import tree
 
 
 class OfAlgorithm(NamedTuple):
@@ -47,33 +32,33 @@ class DiscreteDefinitions:
     of: dict[str, Any]
     stored: set[str]
     followed: list[str]
-    equations: list[Statement]
-    whens: list[Branches]
-    initial: list[Statement]
-    algorithms: list[tuple[Statement, ...]]
+    equations: list[tree.Statement]
+    whens: list[tree.Branches]
+    initial: list[tree.Statement]
+    algorithms: list[tuple[tree.Statement, ...]]
     assigned: list[list[str]]
 
 
-def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> DiscreteDefinitions:
+def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> DiscreteDefinitions:
     """Splits the statements of a model."""
-    found = [s for s in model.equations if isinstance(s, Branches) and s.kind == "when"]
+    found = [s for s in model.equations if isinstance(s, tree.Branches) and s.kind == "when"]
     whens = _merged(found)
     others = _with_choices((s for s in model.equations if s not in found) if found else model.equations, is_discrete)
     algorithms = []
     for section in model.algorithms:
-        inside = [s for s in section if isinstance(s, Branches) and s.kind == "when"]
-        rest = tuple(s for s in section if not (isinstance(s, Branches) and s.kind == "when"))
+        inside = [s for s in section if isinstance(s, tree.Branches) and s.kind == "when"]
+        rest = tuple(s for s in section if not (isinstance(s, tree.Branches) and s.kind == "when"))
         whens += inside
-        if any(not isinstance(s, Effect) for s in rest):
+        if any(not isinstance(s, tree.Effect) for s in rest):
             algorithms.append(rest)
     by_when = set(with_entries((name for s in whens for _, body in s.branches for name in assigned_in(body)), model))
     bindings = [
-        Equality(Reference((d.name,)), d.value, d.line)
+        tree.Equality(tree.Reference((d.name,)), d.value, d.line)
         for d in model.declarations
         if d.value is not None and is_discrete(d.name)
     ]
     candidates = [(s, _definable(s, is_discrete, by_when)) for s in [*others, *bindings]]
-    equations: list[Statement] = [s for s, sides in candidates if not sides]
+    equations: list[tree.Statement] = [s for s, sides in candidates if not sides]
     of: dict[str, Any]
     of, left = _matched([(s, sides) for s, sides in candidates if sides], is_discrete)
     equations += left
@@ -85,7 +70,7 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
             if is_discrete(name):
                 of[name] = k
             else:
-                equations.append(Equality(Reference((name,)), OfAlgorithm(k, name), section[0].line))  # type: ignore[arg-type]
+                equations.append(tree.Equality(tree.Reference((name,)), OfAlgorithm(k, name), section[0].line))  # type: ignore[arg-type]
     read_before = set(with_entries(_read_before((model.equations, model.algorithms, tuple(bindings))), model))
     followed = [name for name in of if name in read_before and name not in by_when]
     return DiscreteDefinitions(
@@ -94,10 +79,10 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
     )  # fmt: skip
 
 
-def _merged(whens: list[Branches]) -> list[Branches]:
+def _merged(whens: list[tree.Branches]) -> list[tree.Branches]:
     """The whens of equations, those with one condition as one: what they assign at an instant holds for all of them."""
-    by_condition: dict[Expression, int] = {}
-    out: list[Branches] = []
+    by_condition: dict[tree.Expression, int] = {}
+    out: list[tree.Branches] = []
     for s in whens:
         condition, body = s.branches[0]
         if len(s.branches) == 1 and condition in by_condition:
@@ -110,26 +95,26 @@ def _merged(whens: list[Branches]) -> list[Branches]:
     return out
 
 
-def _with_choices(statements: Iterable[Statement], is_discrete: Callable[[str], bool]) -> list[Statement]:
+def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool]) -> list[tree.Statement]:
     """The statements with an equation for each discrete variable that all branches of an `if` determine."""
-    out: list[Statement] = []
+    out: list[tree.Statement] = []
     for s in statements:
-        if not (isinstance(s, Branches) and s.kind == "if"):
+        if not (isinstance(s, tree.Branches) and s.kind == "if"):
             out.append(s)
             continue
         conditions = [c for c, _ in s.branches]
         bodies = [_with_choices(body, is_discrete) for _, body in s.branches]
         values = [
             {e.left.path: e.right for e in body
-             if isinstance(e, Equality) and isinstance(e.left, Reference) and is_discrete(e.left.path)}
+             if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(e.left.path)}
             for body in bodies
         ]  # fmt: skip
-        names = [n for n in values[0] if all(n in v for v in values)] if conditions[-1] == Truth(True) else []
+        names = [n for n in values[0] if all(n in v for v in values)] if conditions[-1] == tree.Truth(True) else []
         for n in names:
             branches = tuple((c, v[n]) for c, v in zip(conditions[:-1], values, strict=False))
-            out.append(Equality(Reference((n,)), Choice(branches, values[-1][n]), s.line))
+            out.append(tree.Equality(tree.Reference((n,)), tree.Choice(branches, values[-1][n]), s.line))
         rest = tuple(
-            (c, tuple(e for e in body if not (isinstance(e, Equality) and getattr(e.left, "path", None) in names)))
+            (c, tuple(e for e in body if not (isinstance(e, tree.Equality) and getattr(e.left, "path", None) in names)))
             for c, body in zip(conditions, bodies, strict=True)
         )
         if any(body for _, body in rest):
@@ -137,13 +122,15 @@ def _with_choices(statements: Iterable[Statement], is_discrete: Callable[[str], 
     return out
 
 
-def _definable(s: Statement, is_discrete: Callable[[str], bool], by_when: set[str]) -> list[tuple[str, Expression]]:
+def _definable(
+    s: tree.Statement, is_discrete: Callable[[str], bool], by_when: set[str]
+) -> list[tuple[str, tree.Expression]]:
     """The variables that an equation can determine, each with its value."""
-    if not isinstance(s, Equality):
+    if not isinstance(s, tree.Equality):
         return []
     out = []
     for side, other in ((s.left, s.right), (s.right, s.left)):
-        if isinstance(side, Reference):
+        if isinstance(side, tree.Reference):
             name = side.path
             if is_discrete(name) and name not in by_when:
                 out.append((name, other))
@@ -151,11 +138,11 @@ def _definable(s: Statement, is_discrete: Callable[[str], bool], by_when: set[st
 
 
 def _matched(
-    candidates: list[tuple[Any, list[tuple[str, Expression]]]], is_discrete: Callable[[str], bool]
-) -> tuple[dict[str, Expression], list[Statement]]:
+    candidates: list[tuple[Any, list[tuple[str, tree.Expression]]]], is_discrete: Callable[[str], bool]
+) -> tuple[dict[str, tree.Expression], list[tree.Statement]]:
     """(One equation for each variable, by augmenting paths; equations that are left, of continuous variables)."""
     owner: dict[str, int] = {}
-    left: list[Statement] = []
+    left: list[tree.Statement] = []
 
     def place(k: int, seen: set[str]) -> bool:
         for name, _ in candidates[k][1]:
@@ -169,7 +156,7 @@ def _matched(
 
     def may_be_left(k: int) -> bool:
         other = candidates[k][1][0][1]
-        return len(candidates[k][1]) == 1 and isinstance(other, Reference) and not is_discrete(other.path)
+        return len(candidates[k][1]) == 1 and isinstance(other, tree.Reference) and not is_discrete(other.path)
 
     for k in sorted(range(len(candidates)), key=may_be_left):
         if not place(k, set()):
@@ -180,27 +167,27 @@ def _matched(
     return {name: dict(candidates[k][1])[name] for name, k in sorted(owner.items(), key=lambda item: item[1])}, left
 
 
-def assigned_in(statements: tuple[Statement, ...]) -> Iterator[str]:
+def assigned_in(statements: tuple[tree.Statement, ...]) -> Iterator[str]:
     """The names that equations or assignments determine by standing on their left."""
     for s in statements:
-        if isinstance(s, Equality | Assignment):
-            for each in s.left.entries if isinstance(s.left, Several) else (s.left,):
-                if isinstance(each, Reference):
+        if isinstance(s, tree.Equality | tree.Assignment):
+            for each in s.left.entries if isinstance(s.left, tree.Several) else (s.left,):
+                if isinstance(each, tree.Reference):
                     yield _name(each)
-        elif isinstance(s, Branches):
+        elif isinstance(s, tree.Branches):
             for _, body in s.branches:
                 yield from assigned_in(body)
-        elif isinstance(s, Loop):
+        elif isinstance(s, tree.Loop):
             yield from assigned_in(s.body)
 
 
-def _name(e: Reference) -> str:
+def _name(e: tree.Reference) -> str:
     """The name of what a reference stands for; a subscript that is not a number is '?' in it."""
     numbers = [",".join(str(getattr(x, "value", "?")) for x in s) for s in e.subscripts]
     return ".".join(f"{part}[{n}]" if n else part for part, n in zip(e.parts, numbers, strict=True))
 
 
-def with_entries(names: Iterable[str], model: Class) -> list[str]:
+def with_entries(names: Iterable[str], model: tree.Class) -> list[str]:
     """The names, with those of all entries for an array and where a name has a '?'."""
     out: dict[str, None] = {}
     declared = {d.name for d in model.declarations}
@@ -215,6 +202,10 @@ def with_entries(names: Iterable[str], model: Class) -> list[str]:
 
 def _read_before(statement: Any) -> Iterator[str]:
     """The names in pre(…), edge(…) and change(…)."""
-    for e in each_part(statement):
-        if isinstance(e, Call) and e.function in ("pre", "edge", "change") and isinstance(e.arguments[0], Reference):
+    for e in tree.each_part(statement):
+        if (
+            isinstance(e, tree.Call)
+            and e.function in ("pre", "edge", "change")
+            and isinstance(e.arguments[0], tree.Reference)
+        ):
             yield _name(e.arguments[0])

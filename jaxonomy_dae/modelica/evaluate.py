@@ -9,31 +9,11 @@ import sympy
 
 from ..errors import ModelError
 from ..modeling.symbols import VariableSymbol, der
+from . import tree
 from .builtin import FUNCTIONS, matrix_product
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
 from .read_base import FUNCTION
-from .tree import (
-    Array,
-    Binary,
-    Call,
-    Choice,
-    Class,
-    Comprehension,
-    End,
-    Expression,
-    Matrix,
-    Number,
-    Part,
-    Range,
-    Reference,
-    Several,
-    Text,
-    Truth,
-    Unary,
-    Whole,
-    entry_name,
-)
 from .values import Record, Results, Value, both, chosen, either, entrywise, is_condition, negated
 
 Names = Callable[[str], Value]  # the value of a name; raises KeyError for an unknown one
@@ -52,7 +32,7 @@ class Evaluator:
 
     def __init__(
         self,
-        classes: Mapping[str, Class],
+        classes: Mapping[str, tree.Class],
         names: Names,
         special: Mapping[str, Callable[..., Value]],
         externals: Mapping[str, Callable[..., Value]],
@@ -70,16 +50,16 @@ class Evaluator:
 
     # --- expressions -------------------------------------------------------------------------------------------------
 
-    def evaluate(self, e: Expression, names: Names | None = None) -> Value:
+    def evaluate(self, e: tree.Expression, names: Names | None = None) -> Value:
         """The value of an expression, with `names` in place of the model's; the first result of a function."""
         value = self.results(e, names)
         return value[0] if isinstance(value, Results) else value
 
-    def results(self, e: Expression, names: Names | None = None) -> Value:
+    def results(self, e: tree.Expression, names: Names | None = None) -> Value:
         """As `evaluate`, but all results of a function."""
         return _EVALUATED[type(e)](self, e, names or self.names)
 
-    def _reference(self, e: Reference, names: Names) -> Value:
+    def _reference(self, e: tree.Reference, names: Names) -> Value:
         path = e.path
         if path in self.literals:
             return self.literals[path]
@@ -90,7 +70,7 @@ class Evaluator:
                 pass
         return self._by_parts(e, names)
 
-    def _by_parts(self, e: Reference, names: Names) -> Value:
+    def _by_parts(self, e: tree.Reference, names: Names) -> Value:
         """A reference into an array or record: the longest beginning that has a name, then fields and subscripts."""
         if any(e.subscripts):
             written = self._entry_name(e, names)
@@ -112,35 +92,35 @@ class Evaluator:
             return value
         raise ModelError(f"'{e.path}' is not declared")
 
-    def name_of(self, e: Reference) -> str:
+    def name_of(self, e: tree.Reference) -> str:
         """The name of a variable that is declared by itself, an entry of an array among them."""
         return (self._entry_name(e, self.names) if any(e.subscripts) else None) or e.path
 
     def entries_of(self, name: str, value: list) -> Iterator[tuple[str, Value]]:
         """The entries of an array that are declared one by one: names and values."""
         for place in self.entries.get(name, ()):
-            yield entry_name(name, place), functools.reduce(lambda entry, k: entry[k - 1], place, value)
+            yield tree.entry_name(name, place), functools.reduce(lambda entry, k: entry[k - 1], place, value)
 
-    def _entry_name(self, e: Reference, names: Names) -> str | None:
+    def _entry_name(self, e: tree.Reference, names: Names) -> str | None:
         """The name of an entry that is declared by itself, as 'x[2].y'."""
         out = []
         for part, subscripts in zip(e.parts, e.subscripts, strict=True):
             try:
-                numbers = [self.constant(s, names) for s in subscripts if not isinstance(s, Whole | End)]
+                numbers = [self.constant(s, names) for s in subscripts if not isinstance(s, tree.Whole | tree.End)]
             except (ModelError, KeyError):
                 return None
             if len(numbers) != len(subscripts) or not all(isinstance(n, int) for n in numbers):
                 return None
-            out.append(entry_name(part, numbers) if numbers else part)
+            out.append(tree.entry_name(part, numbers) if numbers else part)
         return ".".join(out)
 
-    def _entry(self, value: Value, subscripts: tuple[Expression, ...], names: Names) -> Value:
+    def _entry(self, value: Value, subscripts: tuple[tree.Expression, ...], names: Names) -> Value:
         if not subscripts:
             return value
         if not isinstance(value, list):
             raise ModelError(f"{value!r} is not an array, but has a subscript")
         first, *rest = subscripts
-        if isinstance(first, Whole):
+        if isinstance(first, tree.Whole):
             chosen_rows: Value = value
         else:
             index = self.evaluate(first, with_end(names, len(value)))
@@ -160,11 +140,11 @@ class Evaluator:
             out = chosen(RELATIONS["=="](index, k), entries[k - 1], out, self.quiet)
         return out
 
-    def _unary(self, e: Unary, names: Names) -> Value:
+    def _unary(self, e: tree.Unary, names: Names) -> Value:
         value = self.evaluate(e.operand, names)
         return entrywise(negated if e.operator == "not" else lambda x: -x, value)
 
-    def _binary(self, e: Binary, names: Names) -> Value:
+    def _binary(self, e: tree.Binary, names: Names) -> Value:
         sign = e.operator
         if sign in ("and", "or"):
             a = self.evaluate(e.left, names)
@@ -192,7 +172,7 @@ class Evaluator:
         stays = isinstance(value, sympy.Piecewise) and not moves(value)
         return self.give_name(value) if value.atoms(VariableSymbol) and not stays else value
 
-    def _choice(self, e: Choice, names: Names) -> Value:
+    def _choice(self, e: tree.Choice, names: Names) -> Value:
         pairs = []
         depth = len(self.guards)
         for condition, value in e.branches:
@@ -213,35 +193,35 @@ class Evaluator:
             out = chosen(condition, value, out, self.quiet or condition in self.quieted)
         return out
 
-    def _comprehension(self, e: Comprehension, names: Names) -> list:
+    def _comprehension(self, e: tree.Comprehension, names: Names) -> list:
         (name, over), *rest = e.iterators
         values = self._range_of(over, names)
-        inner = Comprehension(e.value, tuple(rest)) if rest else e.value
+        inner = tree.Comprehension(e.value, tuple(rest)) if rest else e.value
         return [self.evaluate(inner, _with(names, name, v)) for v in values]
 
-    def _range_of(self, e: Expression | None, names: Names) -> list:
+    def _range_of(self, e: tree.Expression | None, names: Names) -> list:
         if e is None:
             raise ModelError("a loop without a range")
         values = self.evaluate(e, names)
         return values if isinstance(values, list) else [values]
 
-    def _range(self, e: Range, names: Names) -> list:
+    def _range(self, e: tree.Range, names: Names) -> list:
         first, step, last = (self.constant(x, names) for x in (e.first, e.step, e.last))
         count = math.floor(round((last - first) / step, 6)) + 1  # rounding: 0.3 / 0.1 is below 3
         return [first + k * step for k in range(max(count, 0))]
 
-    def _matrix(self, e: Matrix, names: Names) -> list:
+    def _matrix(self, e: tree.Matrix, names: Names) -> list:
         rows = []
         for row in e.rows:
             entries = [self.evaluate(x, names) for x in row]
             rows.append([x for entry in entries for x in (entry if isinstance(entry, list) else [entry])])
         return rows
 
-    def _part(self, e: Part, names: Names) -> Value:
+    def _part(self, e: tree.Part, names: Names) -> Value:
         whole = self.evaluate(e.whole, names)
         return _field(whole, e.field) if e.field is not None else self._entry(whole, e.subscripts, names)
 
-    def constant(self, e: Expression, names: Names | None = None) -> Value:
+    def constant(self, e: tree.Expression, names: Names | None = None) -> Value:
         """The value of an expression that must be known now, such as a subscript or the end of a loop."""
         value = self.evaluate(e, names)
         if not isinstance(value, int | float | bool | str | list):
@@ -250,7 +230,7 @@ class Evaluator:
 
     # --- calls -------------------------------------------------------------------------------------------------------
 
-    def _call(self, e: Call, names: Names) -> Value:
+    def _call(self, e: tree.Call, names: Names) -> Value:
         name = e.function
         if name in self.special:
             return self.special[name](*e.arguments)
@@ -271,7 +251,7 @@ class Evaluator:
                 pass
         return self.call(name, arguments, named)
 
-    def _without_events(self, e: Call, names: Names) -> Value:
+    def _without_events(self, e: tree.Call, names: Names) -> Value:
         if e.function == "smooth" and self.constant(e.arguments[0], names) == 0:
             return self.evaluate(e.arguments[1], names)  # continuous only: its kinks stay events
         before, self.quiet = self.quiet, True
@@ -283,9 +263,9 @@ class Evaluator:
             self.quieted.add(value)
         return value
 
-    def _applied(self, e: Expression, names: Names) -> Value:
+    def _applied(self, e: tree.Expression, names: Names) -> Value:
         """A function as an argument, with those of its arguments that are given."""
-        if not isinstance(e, Call):
+        if not isinstance(e, tree.Call):
             raise ModelError("a function as an argument has its arguments in parentheses")
         given = {k: self.evaluate(v, names) for k, v in e.named}
         return lambda *arguments, **more: self.call(e.function, list(arguments), given | more)
@@ -346,26 +326,26 @@ def _refused(_: Evaluator, e: Any, __: Names) -> NoReturn:
 
 
 _EVALUATED: dict[type, Callable[[Evaluator, Any, Names], Value]] = {
-    Number: lambda self, e, names: e.value,
-    Truth: lambda self, e, names: e.truth,
-    Text: lambda self, e, names: e.text,
-    End: lambda self, e, names: names("end"),
-    Reference: Evaluator._reference,
-    Call: Evaluator._call,
-    Unary: Evaluator._unary,
-    Binary: Evaluator._binary,
-    Choice: Evaluator._choice,
-    Array: lambda self, e, names: [x for a in e.entries for x in _entries(self, a, names)],
-    Matrix: Evaluator._matrix,
-    Range: Evaluator._range,
-    Comprehension: Evaluator._comprehension,
-    Part: Evaluator._part,
-    Several: lambda self, e, names: [None if x is None else self.evaluate(x, names) for x in e.entries],
-    Whole: _refused,
+    tree.Number: lambda self, e, names: e.value,
+    tree.Truth: lambda self, e, names: e.truth,
+    tree.Text: lambda self, e, names: e.text,
+    tree.End: lambda self, e, names: names("end"),
+    tree.Reference: Evaluator._reference,
+    tree.Call: Evaluator._call,
+    tree.Unary: Evaluator._unary,
+    tree.Binary: Evaluator._binary,
+    tree.Choice: Evaluator._choice,
+    tree.Array: lambda self, e, names: [x for a in e.entries for x in _entries(self, a, names)],
+    tree.Matrix: Evaluator._matrix,
+    tree.Range: Evaluator._range,
+    tree.Comprehension: Evaluator._comprehension,
+    tree.Part: Evaluator._part,
+    tree.Several: lambda self, e, names: [None if x is None else self.evaluate(x, names) for x in e.entries],
+    tree.Whole: _refused,
 }
 
 
-def _entries(self: Evaluator, e: Expression, names: Names) -> list[Value]:
+def _entries(self: Evaluator, e: tree.Expression, names: Names) -> list[Value]:
     """The entries that one argument of {…} stands for: several for `f(i) for i in …`."""
     value = self.evaluate(e, names)
-    return value if isinstance(e, Comprehension) else [value]
+    return value if isinstance(e, tree.Comprehension) else [value]

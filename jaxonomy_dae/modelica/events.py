@@ -18,24 +18,10 @@ from ..aliases import Condition
 from ..errors import ModelError
 from ..modeling.events import EventFlag, Sampled, assign, pre, reinit, terminate
 from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+from . import tree
 from .before_only import BeforeOnly
 from .definitions import assigned_in, with_entries
 from .scope import Scope, before, located
-from .tree import (
-    Array,
-    Assignment,
-    Binary,
-    Branches,
-    Call,
-    Effect,
-    Equality,
-    Expression,
-    Loop,
-    Reference,
-    Several,
-    Statement,
-    Unary,
-)
 from .values import (
     Value,
     as_condition,
@@ -120,7 +106,7 @@ def _hidden(scope: Scope, name: str, start: float) -> DiscreteSymbol:
     return DiscreteSymbol(name)
 
 
-def _with_whens(scope: Scope, value: Value, within: tuple[Branches, ...] = ()) -> Value:
+def _with_whens(scope: Scope, value: Value, within: tuple[tree.Branches, ...] = ()) -> Value:
     """The value of a mode where a `when` is due that assigns what the mode reads: equations and whens of an instant are
     one system, so that a mode that makes the when happen does not meet the values before it. So does the condition of a
     when that reads what another one assigns; `within` are those asked about already."""
@@ -166,10 +152,10 @@ def _chosen_of(value: Value, replacements: list[Replacement]) -> Value:
     return value
 
 
-def _simple_whens(scope: Scope) -> Iterator[Branches]:
+def _simple_whens(scope: Scope) -> Iterator[tree.Branches]:
     """The whens of one branch that assign values and do nothing else."""
     for s in scope.definitions.whens:
-        if len(s.branches) == 1 and all(isinstance(each, Equality | Assignment) for each in s.branches[0][1]):
+        if len(s.branches) == 1 and all(isinstance(each, tree.Equality | tree.Assignment) for each in s.branches[0][1]):
             yield s
 
 
@@ -192,10 +178,10 @@ def write_end_of_start(scope: Scope) -> None:
 Rise = tuple[Any, Value]  # the truth of a condition when branches were chosen last, a discrete variable; the condition
 
 
-def write_when(scope: Scope, s: Branches) -> None:
+def write_when(scope: Scope, s: tree.Branches) -> None:
     """Adds the events of a `when`."""
     done = [assign(scope.done[s], 1)] if s in scope.done else []
-    chain: list[tuple[list[Rise], tuple[Statement, ...]]] = []
+    chain: list[tuple[list[Rise], tuple[tree.Statement, ...]]] = []
     for condition, body in s.branches:
         found = [_event(scope, each, body, chain, done, len(s.branches) > 1) for each in _each_condition(condition)]
         chain.append(([r for r in found if r is not None], body))
@@ -204,7 +190,12 @@ def write_when(scope: Scope, s: Branches) -> None:
 
 
 def _event(
-    scope: Scope, condition: Expression, body: tuple[Statement, ...], chain: list, more: list[Any], among: bool
+    scope: Scope,
+    condition: tree.Expression,
+    body: tuple[tree.Statement, ...],
+    chain: list,
+    more: list[Any],
+    among: bool,
 ) -> Rise | None:
     """Adds one event, with `more` actions; for a branch `among` others, returns what its event rests on instead.
     Branches of clocks and of the initial time are events of their own; a clock's does not act where a branch before it
@@ -220,7 +211,7 @@ def _event(
         if actions := _actions(scope, body, functools.reduce(both, conditions, True)):
             scope.component.when(clocks[0], *actions, *more)
         return None
-    at_start = any(isinstance(p, Call) and p.function == "initial" for p in parts)
+    at_start = any(isinstance(p, tree.Call) and p.function == "initial" for p in parts)
     if among and not at_start:
         return _hidden(scope, f":held[{len(scope.component.parameters)}]", 1), holds
     if actions := _actions(scope, body, True):
@@ -233,7 +224,7 @@ def _risen(rises: list[Rise]) -> Value:
     return functools.reduce(either, (both(holds, plain(sympy.Eq(held, 0))) for held, holds in rises), False)
 
 
-def _write_chain(scope: Scope, chain: list[tuple[list[Rise], tuple[Statement, ...]]]) -> None:
+def _write_chain(scope: Scope, chain: list[tuple[list[Rise], tuple[tree.Statement, ...]]]) -> None:
     """Adds the events of branches of which the first acts whose condition becomes true (Modelica Language Specification
     3.6, 8.3.5). Two events in turn, as for modes that change at once."""
     kept, ends = scope.kept.in_events, EventFlag.AT_START | EventFlag.REVOCABLE
@@ -258,19 +249,19 @@ def _write_chain(scope: Scope, chain: list[tuple[list[Rise], tuple[Statement, ..
         scope.component._event(condition, (*actions, assign(turn, 1 - now)), None, EventFlag.LISTED)
 
 
-def _before_tick(scope: Scope, parts: list[Expression]) -> list[Value]:
+def _before_tick(scope: Scope, parts: list[tree.Expression]) -> list[Value]:
     """The conditions beside a clock, at its tick."""
     with scope.at_event():
         return [v for v in (scope.evaluate(_inner(p)) for p in parts) if not isinstance(v, Sampled)]
 
 
-def _pairs(scope: Scope, body: tuple[Statement, ...]) -> list[tuple[Any, Value]]:
+def _pairs(scope: Scope, body: tuple[tree.Statement, ...]) -> list[tuple[Any, Value]]:
     """Pairs (variable, new value) of all actions, as `_each_action` finds them, with the values before the event."""
     with scope.at_event():
         return list(_each_action(scope, body))
 
 
-def _actions(scope: Scope, body: tuple[Statement, ...], only_if: Value) -> list[Any]:
+def _actions(scope: Scope, body: tuple[tree.Statement, ...], only_if: Value) -> list[Any]:
     return [
         terminate(target) if isinstance(target, str) else _action(target, _first(target, [(only_if, value)]))
         for target, value in _pairs(scope, body)
@@ -290,29 +281,29 @@ def _first(target: Any, cases: list[tuple[Value, Value]]) -> Value:
     return value
 
 
-def _each_action(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Target, Value]]:
+def _each_action(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tuple[Target, Value]]:
     """Pairs (variable, new value); a text for `terminate`."""
-    if any(isinstance(s, Assignment | Loop) for s in body):
-        yield from _of_algorithm(scope, tuple(s for s in body if not isinstance(s, Effect)))
-        body = tuple(s for s in body if isinstance(s, Effect))
+    if any(isinstance(s, tree.Assignment | tree.Loop) for s in body):
+        yield from _of_algorithm(scope, tuple(s for s in body if not isinstance(s, tree.Effect)))
+        body = tuple(s for s in body if isinstance(s, tree.Effect))
     for s in body:
-        if isinstance(s, Effect):
+        if isinstance(s, tree.Effect):
             name, arguments = s.call.function, s.call.arguments
             if name == "reinit":
                 yield scope.evaluate(arguments[0]), sympy.sympify(scope.evaluate(arguments[1]))
             elif name == "terminate":
                 yield str(scope.evaluate(arguments[0])), None
-        elif isinstance(s, Equality | Assignment):
-            several = isinstance(s.left, Several)
+        elif isinstance(s, tree.Equality | tree.Assignment):
+            several = isinstance(s.left, tree.Several)
             found = scope.interpreter.results(s.right) if several else scope.evaluate(s.right)
             yield from _assigned(scope, s.left, found)
-        elif isinstance(s, Branches) and s.kind == "if":
+        elif isinstance(s, tree.Branches) and s.kind == "if":
             yield from _chosen_actions(scope, s)
         else:
             raise ModelError(f"a {type(s).__name__.lower()} in a when")
 
 
-def _of_algorithm(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Target, Value]]:
+def _of_algorithm(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tuple[Target, Value]]:
     """What statements assign one after another. A variable has its value before the event until it is assigned, and
     what is assigned once and then read is read as the new value of the variable."""
     model, stored = scope.flat.model, scope.definitions.stored
@@ -330,13 +321,13 @@ def _of_algorithm(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[T
         yield DiscreteSymbol(n), sympy.sympify(as_number(value))
 
 
-def _assigned(scope: Scope, target: Expression, value: Value) -> Iterator[tuple[Target, Value]]:
-    if isinstance(target, Several):
+def _assigned(scope: Scope, target: tree.Expression, value: Value) -> Iterator[tuple[Target, Value]]:
+    if isinstance(target, tree.Several):
         for each, v in zip(target.entries, value, strict=False):
             if each is not None:
                 yield from _assigned(scope, each, v)
         return
-    if not isinstance(target, Reference):
+    if not isinstance(target, tree.Reference):
         raise ModelError("in a when, a variable stands on the left")
     name = scope.interpreter.name_of(target)
     if isinstance(value, list):
@@ -349,7 +340,7 @@ def _assigned(scope: Scope, target: Expression, value: Value) -> Iterator[tuple[
         yield DiscreteSymbol(name), sympy.sympify(as_number(value))
 
 
-def _chosen_actions(scope: Scope, s: Branches) -> Iterator[tuple[Target, Value]]:
+def _chosen_actions(scope: Scope, s: tree.Branches) -> Iterator[tuple[Target, Value]]:
     """An `if` within a when: each target has the value of the branch that holds, or the one before."""
     found: dict[sympy.Symbol, list[tuple[Value, Value]]] = {}
     otherwise: Value = True
@@ -370,22 +361,22 @@ def _chosen_actions(scope: Scope, s: Branches) -> Iterator[tuple[Target, Value]]
         yield target, value
 
 
-def _conjuncts(e: Expression) -> list[Expression]:
+def _conjuncts(e: tree.Expression) -> list[tree.Expression]:
     """The conditions that `and` joins."""
-    if isinstance(e, Binary) and e.operator == "and":
+    if isinstance(e, tree.Binary) and e.operator == "and":
         return [*_conjuncts(e.left), *_conjuncts(e.right)]
     return [e]
 
 
-def _each_condition(condition: Expression) -> tuple[Expression, ...]:
+def _each_condition(condition: tree.Expression) -> tuple[tree.Expression, ...]:
     """The conditions of which each makes the event: the entries of an array; `change(b)` is b and not b."""
-    if isinstance(condition, Array):
+    if isinstance(condition, tree.Array):
         return tuple(c for entry in condition.entries for c in _each_condition(entry))
-    if isinstance(condition, Call) and condition.function == "change":
-        return (condition.arguments[0], Unary("not", condition.arguments[0]))
+    if isinstance(condition, tree.Call) and condition.function == "change":
+        return (condition.arguments[0], tree.Unary("not", condition.arguments[0]))
     return (condition,)
 
 
-def _inner(condition: Expression) -> Expression:
+def _inner(condition: tree.Expression) -> tree.Expression:
     """The condition whose change to true makes an event: `edge(b)` is that of b."""
-    return condition.arguments[0] if isinstance(condition, Call) and condition.function == "edge" else condition
+    return condition.arguments[0] if isinstance(condition, tree.Call) and condition.function == "edge" else condition

@@ -10,22 +10,9 @@ from itertools import islice
 import sympy
 
 from ..errors import ModelError, nearest
+from . import tree
 from .builtin import FUNCTIONS, filled
 from .evaluate import Evaluator, Names, index_of, local_names, with_end
-from .tree import (
-    Assignment,
-    Branches,
-    Class,
-    Declaration,
-    Equality,
-    Expression,
-    Jump,
-    Loop,
-    Reference,
-    Several,
-    Statement,
-    Whole,
-)
 from .values import Record, Results, Value, chosen, either, negated
 
 MOST_ROUNDS = 100_000  # of a loop that is carried out while the model is read
@@ -65,14 +52,14 @@ class Interpreter(Evaluator):
             return external(*(self._input(d, given, given) for d in inputs))
         return self._carried_out(function, inputs, given)
 
-    def _input(self, d: Declaration, given: dict[str, Value], known: Mapping[str, Value]) -> Value:
+    def _input(self, d: tree.Declaration, given: dict[str, Value], known: Mapping[str, Value]) -> Value:
         if d.name in given:
             return given[d.name]
         if d.value is None:
             raise ModelError(f"the argument '{d.name}' is missing")
         return self.evaluate(d.value, local_names(known, self.names))
 
-    def _carried_out(self, function: Class, inputs: list[Declaration], given: dict[str, Value]) -> Value:
+    def _carried_out(self, function: tree.Class, inputs: list[tree.Declaration], given: dict[str, Value]) -> Value:
         if self.depth > DEEPEST:
             raise ModelError(f"the function '{function.name}' calls itself too often")
         before, guards, self.quiet, self.depth = self.quiet, len(self.guards), True, self.depth + 1
@@ -106,7 +93,7 @@ class Interpreter(Evaluator):
             return value
         return value if sum(1 for _ in islice(sympy.preorder_traversal(value), LONG)) < LONG else self.give_name(value)
 
-    def _unset(self, d: Declaration, names: Names) -> Value:
+    def _unset(self, d: tree.Declaration, names: Names) -> Value:
         """What a variable of a function holds before it is assigned."""
         of = self.classes.get(d.type)
         empty: Value = None
@@ -114,7 +101,7 @@ class Interpreter(Evaluator):
             empty = Record({f.name: self._unset(f, names) for f in of.declarations})
         counts = []
         for dimension in d.dimensions:
-            if isinstance(dimension, Whole):
+            if isinstance(dimension, tree.Whole):
                 return None
             counts.append(self.constant(dimension, names))
         if isinstance(empty, Record):
@@ -124,13 +111,13 @@ class Interpreter(Evaluator):
 
     # --- statements --------------------------------------------------------------------------------------------------
 
-    def assigned_by(self, statements: tuple[Statement, ...], first: Mapping[str, Value] | None = None) -> dict:
+    def assigned_by(self, statements: tuple[tree.Statement, ...], first: Mapping[str, Value] | None = None) -> dict:
         """What an algorithm of the model assigns; `first` are values before it."""
         local: dict[str, Value] = dict(first or {})
         self.execute(statements, local, lambda name: local[name] if name in local else self.names(name))
         return local
 
-    def execute(self, statements: tuple[Statement, ...], local: dict[str, Value], names: Names) -> None:
+    def execute(self, statements: tuple[tree.Statement, ...], local: dict[str, Value], names: Names) -> None:
         """Carries out an algorithm; assigns to `local`.
 
         `return` and `break` become truths in `local`, conditions under a condition that is not constant. What follows
@@ -149,15 +136,15 @@ class Interpreter(Evaluator):
             self.guards.pop()
             self._join(ended, dict(local), copied, local)
 
-    def _statement(self, s: Statement, local: dict[str, Value], names: Names) -> None:
-        if isinstance(s, Assignment | Equality):
-            found = (self.results if isinstance(s.left, Several) else self.evaluate)(s.right, names)
+    def _statement(self, s: tree.Statement, local: dict[str, Value], names: Names) -> None:
+        if isinstance(s, tree.Assignment | tree.Equality):
+            found = (self.results if isinstance(s.left, tree.Several) else self.evaluate)(s.right, names)
             self._assign(s.left, self._named(found), local, names)
-        elif isinstance(s, Branches):
+        elif isinstance(s, tree.Branches):
             self._branches(s, local, names)
-        elif isinstance(s, Loop):
+        elif isinstance(s, tree.Loop):
             self._loop(s, local, names)
-        elif isinstance(s, Jump):
+        elif isinstance(s, tree.Jump):
             local[s.kind] = True
         # What stands alone is a check or a message: assert, print.
 
@@ -167,13 +154,13 @@ class Interpreter(Evaluator):
             otherwise = False if name in ("return", "break") else local.get(name)
             local[name] = self._named(_joined(condition, a.get(name, otherwise), b.get(name, otherwise), self.quiet))
 
-    def _assign(self, target: Expression, value: Value, local: dict[str, Value], names: Names) -> None:
-        if isinstance(target, Several):
+    def _assign(self, target: tree.Expression, value: Value, local: dict[str, Value], names: Names) -> None:
+        if isinstance(target, tree.Several):
             for each, v in zip(target.entries, value, strict=False):
                 if each is not None:
                     self._assign(each, v, local, names)
             return
-        if not isinstance(target, Reference):
+        if not isinstance(target, tree.Reference):
             raise ModelError("only variables can be assigned")
         if len(target.parts) == 1 and not target.subscripts[0]:
             self._assign_whole(target.parts[0], _copied(value), local)
@@ -198,7 +185,7 @@ class Interpreter(Evaluator):
         if subscripts:
             first, *others = subscripts
             entries = list(old) if isinstance(old, list) else []
-            if isinstance(first, Whole):
+            if isinstance(first, tree.Whole):
                 where: Value = list(range(1, len(entries) + 1))
             else:
                 where = self.evaluate(first, with_end(names, len(entries)))
@@ -218,7 +205,7 @@ class Interpreter(Evaluator):
             return record
         return _copied(value)
 
-    def _branches(self, s: Branches, local: dict[str, Value], names: Names) -> None:
+    def _branches(self, s: tree.Branches, local: dict[str, Value], names: Names) -> None:
         """An `if`; a branch whose condition is not constant is carried out on a copy."""
         for k, (condition, body) in enumerate(s.branches):
             holds = self.evaluate(condition, names)
@@ -238,7 +225,7 @@ class Interpreter(Evaluator):
             self._join(holds, results[0], results[1], local)
             return
 
-    def _loop(self, s: Loop, local: dict[str, Value], names: Names) -> None:
+    def _loop(self, s: tree.Loop, local: dict[str, Value], names: Names) -> None:
         outer = local.get("break", False)
         if s.condition is None:
             self._rounds(s.iterators, s.body, local, names)
@@ -246,7 +233,7 @@ class Interpreter(Evaluator):
             self._while(s.condition, s.body, local, names)
         local["break"] = outer
 
-    def _while(self, condition: Expression, body: tuple, local: dict[str, Value], names: Names) -> None:
+    def _while(self, condition: tree.Expression, body: tuple, local: dict[str, Value], names: Names) -> None:
         for _ in range(MOST_ROUNDS):
             holds = self.evaluate(condition, names)
             if not isinstance(holds, bool):

@@ -9,34 +9,7 @@ from collections.abc import Iterator
 from typing import Any, NoReturn
 
 from ..errors import ModelError
-from .tree import (
-    Array,
-    Assignment,
-    Binary,
-    Branches,
-    Call,
-    Choice,
-    Class,
-    Comprehension,
-    Declaration,
-    Effect,
-    End,
-    Equality,
-    Expression,
-    Jump,
-    Loop,
-    Matrix,
-    Number,
-    Part,
-    Range,
-    Reference,
-    Several,
-    Statement,
-    Text,
-    Truth,
-    Unary,
-    Whole,
-)
+from . import tree
 
 _TOKEN = re.compile(
     r"""(?:\s+|//[^\n]*|/\*.*?\*/)*
@@ -65,7 +38,7 @@ BEFORE_MODIFIER = frozenset({"final", "each", "redeclare", "replaceable"})
 SECTION_ENDS = ("end", "equation", "algorithm", "initial", "external", "protected", "public", "annotation")
 
 
-def read_base(text: str) -> Class:
+def read_base(text: str) -> tree.Class:
     """The outermost class of a Base Modelica text: a package that holds functions, types and the model.
 
     **Raises:**
@@ -80,14 +53,14 @@ def read_modifiers(text: str) -> dict[str, Any]:
     return Reader(text).modifiers()
 
 
-def written(name: str) -> Reference:
+def written(name: str) -> tree.Reference:
     """A quoted name with subscripts inside, such as 'x[\\'i\\'].y', as the reference x[i].y."""
     parts: list[str] = []
-    subscripts: list[tuple[Expression, ...]] = []
+    subscripts: list[tuple[tree.Expression, ...]] = []
     for part, inside in _PART.findall(re.sub(r"\\(.)", r"\1", name)):
         parts.append(part)
         subscripts.append(Reader(f"[{inside}]")._subscripts() if inside else ())
-    return Reference(tuple(parts), tuple(subscripts))
+    return tree.Reference(tuple(parts), tuple(subscripts))
 
 
 class Reader:
@@ -196,34 +169,34 @@ class Reader:
 
     # --- expressions -------------------------------------------------------------------------------------------------
 
-    def expression(self) -> Expression:
+    def expression(self) -> tree.Expression:
         if self.take("if"):
             branches = [self._branch()]
             while self.take("elseif"):
                 branches.append(self._branch())
             self.need("else")
-            return Choice(tuple(branches), self.expression())
+            return tree.Choice(tuple(branches), self.expression())
         first = self.operation(1)
         if not self.take(":"):
             return first
         second = self.operation(1)
         if self.take(":"):
-            return Range(first, second, self.operation(1))
-        return Range(first, Number(1), second)
+            return tree.Range(first, second, self.operation(1))
+        return tree.Range(first, tree.Number(1), second)
 
-    def _branch(self) -> tuple[Expression, Expression]:
+    def _branch(self) -> tuple[tree.Expression, tree.Expression]:
         condition = self.expression()
         self.need("then")
         return condition, self.expression()
 
-    def operation(self, level: int) -> Expression:
+    def operation(self, level: int) -> tree.Expression:
         """An operation whose operators bind at least as strongly as `level`."""
         if level <= _NOT and self.take("not"):
-            left: Expression = Unary("not", self.operation(_NOT + 1))
+            left: tree.Expression = tree.Unary("not", self.operation(_NOT + 1))
         elif level <= _SUM + 1 and (sign := self.take("-", "+", ".-", ".+")):
             left = self.operation(_SUM + 1)  # a sign binds as weakly as a sum: -a * b is -(a * b)
             if "-" in sign:
-                left = Number(-left.value) if isinstance(left, Number) else Unary("-", left)
+                left = tree.Number(-left.value) if isinstance(left, tree.Number) else tree.Unary("-", left)
         else:
             left = self.primary()
         while True:
@@ -232,22 +205,22 @@ class Reader:
             if strength < level:
                 return left
             self.i += 1
-            left = Binary(sign, left, self.primary() if strength == _POWER else self.operation(strength + 1))
+            left = tree.Binary(sign, left, self.primary() if strength == _POWER else self.operation(strength + 1))
 
-    def primary(self) -> Expression:
+    def primary(self) -> tree.Expression:
         self.take(".")  # of a name from the outermost package, such as `.Modelica.Constants.pi`
         kind, word = self.kinds[self.i], self.words[self.i]
         if kind == "number":
             self.i += 1
-            return Number(int(word) if word.isdigit() else float(word))
+            return tree.Number(int(word) if word.isdigit() else float(word))
         if kind == "string":
             self.i += 1
-            return Text(word[1:-1])
+            return tree.Text(word[1:-1])
         if kind == "sign":
             if self.take("("):
                 return self._in_parentheses()
             if self.take("{"):
-                return Array(self._arguments("}")[0])
+                return tree.Array(self._arguments("}")[0])
             if self.take("["):
                 rows = [[self.expression()]]
                 while sign := self.take(",", ";"):
@@ -256,21 +229,21 @@ class Reader:
                     else:
                         rows.append([self.expression()])
                 self.need("]")
-                return Matrix(tuple(map(tuple, rows)))
+                return tree.Matrix(tuple(map(tuple, rows)))
             if self.take("-"):  # as in 2^-1
-                return Unary("-", self.primary())
+                return tree.Unary("-", self.primary())
             self._fail("expected an expression")
         if kind == "word":
             if word in ("true", "false"):
                 self.i += 1
-                return Truth(word == "true")
+                return tree.Truth(word == "true")
             if word == "end":
                 self.i += 1
-                return End()
+                return tree.End()
         return self._reference()
 
-    def _in_parentheses(self) -> Expression:
-        entries: list[Expression | None] = []
+    def _in_parentheses(self) -> tree.Expression:
+        entries: list[tree.Expression | None] = []
         while not self.take(")"):
             entries.append(None if self.at(",") else self.expression())
             if not self.at(")"):
@@ -279,11 +252,11 @@ class Reader:
                     entries.append(None)
         if len(entries) == 1 and entries[0] is not None:
             return self._parts_of(entries[0])
-        return Several(tuple(entries))
+        return tree.Several(tuple(entries))
 
-    def _reference(self) -> Expression:
+    def _reference(self) -> tree.Expression:
         parts: list[str] = []
-        subscripts: list[tuple[Expression, ...]] = []
+        subscripts: list[tuple[tree.Expression, ...]] = []
         while not parts or self.take("."):
             name = self.name()
             if INSIDE in name:
@@ -297,31 +270,31 @@ class Reader:
                 subscripts.append(self._subscripts())
         if self.take("("):
             arguments, named = self._arguments(")")
-            return self._parts_of(Call(".".join(parts), arguments, named))
-        return Reference(tuple(parts), tuple(subscripts))
+            return self._parts_of(tree.Call(".".join(parts), arguments, named))
+        return tree.Reference(tuple(parts), tuple(subscripts))
 
-    def _parts_of(self, whole: Expression) -> Expression:
+    def _parts_of(self, whole: tree.Expression) -> tree.Expression:
         while self.at("[", "."):
-            whole = Part(whole, self.name(), ()) if self.take(".") else Part(whole, None, self._subscripts())
+            whole = tree.Part(whole, self.name(), ()) if self.take(".") else tree.Part(whole, None, self._subscripts())
         return whole
 
-    def _subscripts(self) -> tuple[Expression, ...]:
+    def _subscripts(self) -> tuple[tree.Expression, ...]:
         if not self.take("["):
             return ()
-        out: list[Expression] = []
+        out: list[tree.Expression] = []
         while not self.take("]"):
             if self.at(":") and self.keys[self.i + 1] in (",", "]"):
                 self.i += 1
-                out.append(Whole())
+                out.append(tree.Whole())
             else:
                 out.append(self.expression())
             if not self.at("]"):
                 self.need(",")
         return tuple(out)
 
-    def _arguments(self, end: str) -> tuple[tuple[Expression, ...], tuple[tuple[str, Expression], ...]]:
-        arguments: list[Expression] = []
-        named: list[tuple[str, Expression]] = []
+    def _arguments(self, end: str) -> tuple[tuple[tree.Expression, ...], tuple[tuple[str, tree.Expression], ...]]:
+        arguments: list[tree.Expression] = []
+        named: list[tuple[str, tree.Expression]] = []
         while not self.take(end):
             if self.kinds[self.i] in ("word", "quoted") and self.keys[self.i + 1] == "=":
                 name = self.name()
@@ -333,13 +306,13 @@ class Reader:
                 self.need(",")
         return tuple(arguments), tuple(named)
 
-    def _argument(self) -> Expression:
+    def _argument(self) -> tree.Expression:
         if self.take("function"):
-            return Call(FUNCTION, (self.expression(),), ())
+            return tree.Call(FUNCTION, (self.expression(),), ())
         value = self.expression()
-        return Comprehension(value, self._iterators()) if self.take("for") else value
+        return tree.Comprehension(value, self._iterators()) if self.take("for") else value
 
-    def _iterators(self) -> tuple[tuple[str, Expression | None], ...]:
+    def _iterators(self) -> tuple[tuple[str, tree.Expression | None], ...]:
         out = []
         while True:
             out.append((self.name(), self.expression() if self.take("in") else None))
@@ -348,8 +321,8 @@ class Reader:
 
     # --- equations and statements ------------------------------------------------------------------------------------
 
-    def statements(self, *ends: str) -> tuple[Statement, ...]:
-        out: list[Statement] = []
+    def statements(self, *ends: str) -> tuple[tree.Statement, ...]:
+        out: list[tree.Statement] = []
         while not self.at(*ends):
             if self.at("annotation"):
                 self.pass_annotation()
@@ -358,24 +331,24 @@ class Reader:
                 out.append(self.statement())
         return tuple(out)
 
-    def statement(self) -> Statement:
+    def statement(self) -> tree.Statement:
         line = self.line()
         kind = self.take("if", "when", "for", "while", "return", "break")
         if kind in ("if", "when"):
-            out: Statement = Branches(kind, self._branches(), line)
+            out: tree.Statement = tree.Branches(kind, self._branches(), line)
         elif kind == "for":
             iterators = self._iterators()
             self.need("loop")
-            out = Loop(iterators, None, self.statements("end"), line)
+            out = tree.Loop(iterators, None, self.statements("end"), line)
         elif kind == "while":
             condition = self.expression()
             self.need("loop")
-            out = Loop((), condition, self.statements("end"), line)
+            out = tree.Loop((), condition, self.statements("end"), line)
         elif kind:
-            out = Jump(kind, line)
+            out = tree.Jump(kind, line)
         else:
             out = self._simple(line)
-        if isinstance(out, Branches | Loop):
+        if isinstance(out, tree.Branches | tree.Loop):
             self.need("end")
             self.need(kind)
         self.comment()
@@ -383,16 +356,16 @@ class Reader:
         self.need(";")
         return out
 
-    def _simple(self, line: int) -> Statement:
+    def _simple(self, line: int) -> tree.Statement:
         left = self.expression()
         sign = self.take("=", ":=")
         if sign:
-            return (Equality if sign == "=" else Assignment)(left, self.expression(), line)
-        if not isinstance(left, Call):
+            return (tree.Equality if sign == "=" else tree.Assignment)(left, self.expression(), line)
+        if not isinstance(left, tree.Call):
             self._fail("expected '=', ':=' or a call")
-        return Effect(left, line)
+        return tree.Effect(left, line)
 
-    def _branches(self) -> tuple[tuple[Expression, tuple[Statement, ...]], ...]:
+    def _branches(self) -> tuple[tuple[tree.Expression, tuple[tree.Statement, ...]], ...]:
         out = []
         while True:
             condition = self.expression()
@@ -401,7 +374,7 @@ class Reader:
             if not self.take("elseif", "elsewhen"):
                 break
         if self.take("else"):
-            out.append((Truth(True), self.statements("end")))
+            out.append((tree.Truth(True), self.statements("end")))
         return tuple(out)
 
     # --- declarations and classes ------------------------------------------------------------------------------------
@@ -432,10 +405,10 @@ class Reader:
                 self.need(",")
         return out
 
-    def _value(self) -> Expression | None:
+    def _value(self) -> tree.Expression | None:
         return self.expression() if self.take("=", ":=") else None
 
-    def declarations(self) -> Iterator[Declaration]:
+    def declarations(self) -> Iterator[tree.Declaration]:
         """The declarations of one clause, such as `Real a, b = 1;`."""
         line, prefixes = self.line(), self.past(PREFIXES)
         kind, shared, first = self.path(), self._subscripts(), True
@@ -449,10 +422,10 @@ class Reader:
             self.pass_constraint()
             comment = self.comment()
             self.pass_annotation()
-            yield Declaration(prefixes, kind, name, dimensions, modifiers, value, comment, line)
+            yield tree.Declaration(prefixes, kind, name, dimensions, modifiers, value, comment, line)
         self.need(";")
 
-    def file(self) -> Class:
+    def file(self) -> tree.Class:
         if self.take("within"):
             while not self.take(";"):
                 self.i += 1
@@ -462,7 +435,7 @@ class Reader:
             self._fail("expected the end of the text")
         return out
 
-    def definition(self) -> Class:
+    def definition(self) -> tree.Class:
         before = self.past(BEFORE_CLASS)
         kind = self.take(*CLASSES) or ("package" if "operator" in before else "")  # `operator 'constructor'`
         if not kind:
@@ -474,7 +447,7 @@ class Reader:
         self.pass_parentheses()  # of `redeclare function extends f(…)`
         return self._long(kind, name, continues)
 
-    def _stands_for(self, kind: str, name: str) -> Class:
+    def _stands_for(self, kind: str, name: str) -> tree.Class:
         literals: list[str] = []
         alias = None
         if self.take("enumeration"):
@@ -492,20 +465,20 @@ class Reader:
         self.comment()
         self.pass_annotation()
         self.need(";")
-        return Class(kind, name, literals=tuple(literals), alias=alias, comment=comment)
+        return tree.Class(kind, name, literals=tuple(literals), alias=alias, comment=comment)
 
-    def _short(self, name: str) -> Declaration:
+    def _short(self, name: str) -> tree.Declaration:
         """What a short definition stands for."""
         line, prefixes, of = self.line(), self.past(PREFIXES), self.path()
         dimensions = self._subscripts()
         if of == "der":
             self.pass_parentheses()
-        return Declaration(prefixes, of, name, dimensions, self.modifiers(), None, "", line)
+        return tree.Declaration(prefixes, of, name, dimensions, self.modifiers(), None, "", line)
 
-    def _long(self, kind: str, name: str, continues: bool) -> Class:
+    def _long(self, kind: str, name: str, continues: bool) -> tree.Class:
         comment = self.comment()
-        declarations: list[Declaration] = []
-        classes: dict[str, Class] = {}
+        declarations: list[tree.Declaration] = []
+        classes: dict[str, tree.Class] = {}
         bases: list[tuple[str, dict[str, Any]]] = []
         imports: list[tuple[str, str]] = []
         sections: dict[str, list] = {
@@ -545,7 +518,7 @@ class Reader:
         equations, initial = (
             tuple(s for section in sections[k] for s in section) for k in ("equation", "initial equation")
         )
-        return Class(
+        return tree.Class(
             kind, name, tuple(declarations), equations, initial, tuple(sections["algorithm"]),
             tuple(sections["initial algorithm"]), classes, tuple(bases), tuple(imports), annotation, external=external,
             comment=comment, continues=continues,

@@ -10,26 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ..errors import ModelError
+from . import tree
 from .flat_model import FlatModel
 from .rumoca_expressions import PREFIX, SCALAR, VARIABLE, Json, Places, RumocaExpressions, flat_class
-from .tree import (
-    Array,
-    Assignment,
-    Binary,
-    Branches,
-    Call,
-    Declaration,
-    Effect,
-    Equality,
-    Expression,
-    Number,
-    Part,
-    Reference,
-    Statement,
-    Text,
-    Truth,
-    entry_name,
-)
 
 SCHEMA = 43  # of the dictionary; rumoca changes it between its versions, and says nothing of the changes
 VERSION = "0.10.2"  # of rumoca, which writes that schema
@@ -73,14 +56,14 @@ class _Reader:
         initial = [e for op in s["initialization_equation_operations"] for e in self._equations(op)]
         for each in (*s["initial_discrete_values"], *s["initial_parameter_values"]):
             line = self.of.line(each.get("provenance"))
-            initial.append(Equality(self.of.variable(each["target"]), self.of.expression(each["value"], {}), line))
+            initial.append(tree.Equality(self.of.variable(each["target"]), self.of.expression(each["value"], {}), line))
         declarations = [d for v in self.of.variables for d in self._declarations(v)]
         model = flat_class("model", self.of.name, declarations, equations=equations, initial=initial)
         return FlatModel(model, {c.name: c for c in self.of.classes()})
 
     # --- declarations ------------------------------------------------------------------------------------------------
 
-    def _declarations(self, v: Json) -> Iterator[Declaration]:
+    def _declarations(self, v: Json) -> Iterator[tree.Declaration]:
         """A variable; an array as its entries, so that each parameter of an array is a parameter."""
         at, role = v["attributes"], v["role"]
         of = self.of.types[v["value_type"]]
@@ -91,43 +74,43 @@ class _Reader:
         for k, place in enumerate(itertools.product(*(range(1, n + 1) for n in of["dimensions"]))):
             fixed = at.get("fixed")
             modifiers: dict[str, Any] = {
-                "stateSelect": Reference(("StateSelect", _PREFERENCE[at["state_select"]]), ((), ()))
+                "stateSelect": tree.Reference(("StateSelect", _PREFERENCE[at["state_select"]]), ((), ()))
             }
             if at.get("unit") is not None:
-                modifiers["unit"] = Text(at["unit"])
+                modifiers["unit"] = tree.Text(at["unit"])
             if fixed is not None:
-                modifiers["fixed"] = Truth(fixed[k] if len(fixed) > 1 else fixed[0])
+                modifiers["fixed"] = tree.Truth(fixed[k] if len(fixed) > 1 else fixed[0])
             for key in ("start", "nominal", "min", "max"):
                 if at.get(key) is not None and not (key == "start" and self._is_default(at[key], v)):
                     modifiers[key] = self._entry(at[key], place)
             value = self._entry(at["binding"], place) if at.get("binding") is not None else None
-            if constant and value is None and "start" not in modifiers and modifiers.get("fixed") != Truth(False):
+            if constant and value is None and "start" not in modifiers and modifiers.get("fixed") != tree.Truth(False):
                 raise ModelError(f"{self.of.name}: the parameter '{v['name']}' has no value")
-            name = entry_name(v["name"], place) if place else v["name"]
+            name = tree.entry_name(v["name"], place) if place else v["name"]
             line = self.of.line(v.get("declaration"))
             comment = at.get("description") or ""
-            yield Declaration(frozenset(prefixes), SCALAR[of["scalar"]], name, (), modifiers, value, comment, line)
+            yield tree.Declaration(frozenset(prefixes), SCALAR[of["scalar"]], name, (), modifiers, value, comment, line)
 
     def _is_default(self, start: int, v: Json) -> bool:
         """True for a start that rumoca adds: it stands where the variable does."""
         declared = (v.get("declaration") or {}).get("span")
         return declared is not None and self.of.nodes[start][3].get("span") == declared
 
-    def _entry(self, number: int, place: tuple[int, ...]) -> Expression:
+    def _entry(self, number: int, place: tuple[int, ...]) -> tree.Expression:
         """One entry of an array; a value that is no array counts for all entries."""
         e = self.of.expression(number, {})
         for depth, k in enumerate(place):
-            if isinstance(e, Array):
+            if isinstance(e, tree.Array):
                 e = e.entries[k - 1]
-            elif isinstance(e, Number | Truth | Text):
+            elif isinstance(e, tree.Number | tree.Truth | tree.Text):
                 return e
             else:
-                return Part(e, None, tuple(map(Number, place[depth:])))
+                return tree.Part(e, None, tuple(map(tree.Number, place[depth:])))
         return e
 
     # --- equations ---------------------------------------------------------------------------------------------------
 
-    def _equations(self, op: Json) -> Iterator[Statement]:
+    def _equations(self, op: Json) -> Iterator[tree.Statement]:
         kind, inside = next(iter(op.items()))
         line = self.of.line(inside.get("provenance"))
         if kind == "residual":
@@ -145,30 +128,30 @@ class _Reader:
         else:
             self.of.refuse(f"an equation of the kind '{kind}'", inside.get("provenance"))
 
-    def _equality(self, residual: int, places: Places, line: int) -> Equality:
+    def _equality(self, residual: int, places: Places, line: int) -> tree.Equality:
         e = self.of.expression(residual, places)
-        if isinstance(e, Binary) and e.operator in ("-", ".-"):
-            return Equality(e.left, e.right, line)
-        return Equality(e, Number(0.0), line)
+        if isinstance(e, tree.Binary) and e.operator in ("-", ".-"):
+            return tree.Equality(e.left, e.right, line)
+        return tree.Equality(e, tree.Number(0.0), line)
 
-    def _always(self) -> Iterator[Statement]:
+    def _always(self) -> Iterator[tree.Statement]:
         """Equations of discrete variables that hold at all times."""
         for owner in self.of.storage["discrete_value_owners"]:
             for branch in owner["branches"]:
                 if branch["activation"] == "always":
                     for target, value in zip(owner["targets"], branch["values"], strict=True):
                         line = self.of.line(branch.get("provenance") or owner.get("provenance"))
-                        yield Equality(self.of.variable(target), self.of.expression(value["value"], {}), line)
+                        yield tree.Equality(self.of.variable(target), self.of.expression(value["value"], {}), line)
         for each in self.of.storage["discrete_real_equations"]:
             if each["activation"] == "always":
                 yield self._equality(each["residual"], {}, self.of.line(each.get("provenance")))
 
     # --- events ------------------------------------------------------------------------------------------------------
 
-    def _whens(self) -> list[Branches]:
+    def _whens(self) -> list[tree.Branches]:
         """The actions at events, those of one trigger together. Triggers that act on one variable are branches of one
         `when` in their order: Modelica allows one `when` for each variable."""
-        bodies: dict[int, list[tuple[Any, Expression | None, Statement]]] = {}
+        bodies: dict[int, list[tuple[Any, tree.Expression | None, tree.Statement]]] = {}
         targets: dict[Any, list[int]] = {}
         for target, trigger, guard, statement in self._actions():
             bodies.setdefault(trigger, []).append((target, self._guard(guard, trigger), statement))
@@ -180,10 +163,10 @@ class _Reader:
         out = []
         for chain in {id(c): c for c in chains.values()}.values():
             branches = tuple((self.of.condition(t), tuple(_guarded(bodies[t]))) for t in chain)
-            out.append(Branches("when", branches, bodies[chain[0]][0][2].line))
+            out.append(tree.Branches("when", branches, bodies[chain[0]][0][2].line))
         return out
 
-    def _actions(self) -> Iterator[tuple[Any, int, int, Statement]]:
+    def _actions(self) -> Iterator[tuple[Any, int, int, tree.Statement]]:
         """(what is acted on, trigger, guard, statement) of all actions at events, in order."""
         s = self.of.storage
         in_steps: set[int] = set()
@@ -192,7 +175,7 @@ class _Reader:
             for step in transaction["steps"]:
                 for d in step["definitions"]:
                     line = self.of.line(d.get("provenance") or step.get("provenance") or transaction.get("provenance"))
-                    value = Assignment(
+                    value = tree.Assignment(
                         self.of.variable(d["target"]["variable"]), self.of.expression(d["value"], {}), line
                     )
                     yield d["target"]["variable"], step["trigger"], step["guard"], value
@@ -203,13 +186,13 @@ class _Reader:
                     for target, value in zip(owner["targets"], branch["values"], strict=True):
                         if target not in in_steps:
                             line = self.of.line(branch.get("provenance") or owner.get("provenance"))
-                            e = Equality(self.of.variable(target), self.of.expression(value["value"], {}), line)
+                            e = tree.Equality(self.of.variable(target), self.of.expression(value["value"], {}), line)
                             yield target, *when, e
         for each in s["discrete_real_equations"]:
             if each["activation"] != "always":
                 when = self._when(each["activation"], each.get("provenance"))
                 e = self._equality(each["residual"], {}, self.of.line(each.get("provenance")))
-                target = e.left.path if isinstance(e.left, Reference) else ""
+                target = e.left.path if isinstance(e.left, tree.Reference) else ""
                 if not any(self.of.variables[t]["name"] == target for t in in_steps):
                     yield target, *when, e
         for action in s["event_actions"]:
@@ -217,11 +200,11 @@ class _Reader:
             line = self.of.line(action.get("provenance"))
             if kind == "reinitialize":
                 state = self.of.variable(inside["state"])
-                call = Call("reinit", (state, self.of.expression(inside["value"], {})), ())
-                yield ("reinit", inside["state"]), action["trigger"], action["guard"], Effect(call, line)
+                call = tree.Call("reinit", (state, self.of.expression(inside["value"], {})), ())
+                yield ("reinit", inside["state"]), action["trigger"], action["guard"], tree.Effect(call, line)
             elif kind == "terminate":
-                call = Call("terminate", (self.of.expression(inside["message"], {}),), ())
-                yield ("terminate", line), action["trigger"], action["guard"], Effect(call, line)
+                call = tree.Call("terminate", (self.of.expression(inside["message"], {}),), ())
+                yield ("terminate", line), action["trigger"], action["guard"], tree.Effect(call, line)
             elif kind != "assert":
                 self.of.refuse(f"the action '{kind}' at an event", action.get("provenance"))
 
@@ -230,14 +213,14 @@ class _Reader:
             self.of.refuse(f"the activation {activation!r}", where)
         return activation["when"]["trigger"], activation["when"]["guard"]
 
-    def _guard(self, guard: int, trigger: int) -> Expression | None:
+    def _guard(self, guard: int, trigger: int) -> tree.Expression | None:
         """What has to hold beside a trigger; None if nothing has to."""
         if guard == trigger:
             return None
         node = self.of.storage["conditions"][guard]["node"]
         if isinstance(node, Mapping) and "and" in node:
             left, right = (self._guard(node["and"][side], trigger) for side in ("lhs", "rhs"))
-            return right if left is None else left if right is None else Binary("and", left, right)
+            return right if left is None else left if right is None else tree.Binary("and", left, right)
         return self.of.condition(guard)
 
 
@@ -247,16 +230,16 @@ def _places(binders: Sequence[tuple[tuple[int, int], range]]) -> Iterator[Places
         yield dict(zip((key for key, _ in binders), values, strict=True))
 
 
-def _guarded(body: Sequence[tuple[Any, Expression | None, Statement]]) -> Iterator[Statement]:
+def _guarded(body: Sequence[tuple[Any, tree.Expression | None, tree.Statement]]) -> Iterator[tree.Statement]:
     """The statements of one trigger. Those with guards stand in an `if`; later ones are its further branches where they
     act on one variable, and assignments take place one after the other."""
-    chains: dict[Any, list[tuple[Expression, tuple[Statement, ...]]]] = {}
+    chains: dict[Any, list[tuple[tree.Expression, tuple[tree.Statement, ...]]]] = {}
     for target, guard, statement in body:
         if guard is None:
             yield statement
-        elif isinstance(statement, Assignment):
-            yield Branches("if", ((guard, (statement,)),), statement.line)
+        elif isinstance(statement, tree.Assignment):
+            yield tree.Branches("if", ((guard, (statement,)),), statement.line)
         else:
             chains.setdefault(target, []).append((guard, (statement,)))
     for branches in chains.values():
-        yield Branches("if", tuple(branches), branches[0][1][0].line)
+        yield tree.Branches("if", tuple(branches), branches[0][1][0].line)

@@ -9,26 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 from ..errors import ModelError
-from .tree import (
-    Array,
-    Assignment,
-    Binary,
-    Call,
-    Choice,
-    Class,
-    Declaration,
-    Expression,
-    Loop,
-    Number,
-    Part,
-    Range,
-    Reference,
-    Statement,
-    Text,
-    Truth,
-    Unary,
-    Whole,
-)
+from . import tree
 
 Places = Mapping[tuple[int, int], int]  # the value of a domain's binder, by the numbers of the domain and the binder
 Json = Mapping[str, Any]
@@ -77,13 +58,13 @@ class RumocaExpressions:
             subscript += count.get("subscript_count", 0)
             number += _NUMBERS_OF_QUOTIENT if kind == "runtime_quotient_owner" and "model" in count["kind"] else 1
 
-    def classes(self) -> list[Class]:
+    def classes(self) -> list[tree.Class]:
         """The records and functions of the model; each result of a function is a function of its own."""
         records = [self._record(t) for t in self.types if t["scalar"] == "record"]
         functions = ((k, o) for k, f in enumerate(self.functions) for o in range(len(f["outputs"])))
         return records + [self._function(k, o) for k, o in functions]
 
-    def _record(self, of: Json) -> Class:
+    def _record(self, of: Json) -> tree.Class:
         fields = [(f["name"], self.types[f["value_type"]]) for f in of["record_fields"]]
         declared = [_declared(frozenset(), n, t) for n, t in fields]
         return flat_class("record", of["record_name"], declared)
@@ -95,13 +76,13 @@ class RumocaExpressions:
         own = enumerate(of["domain"]["binders"])
         return outer + [((domain, k), range(b["lower"], b["upper"] + 1, b["step"])) for k, b in own]
 
-    def condition(self, number: int) -> Expression:
+    def condition(self, number: int) -> tree.Expression:
         entry = self.storage["conditions"][number]
         node = entry["node"]
         if node == "initial":
-            return Call("initial", (), ())
+            return tree.Call("initial", (), ())
         if node == "always":
-            return Truth(True)
+            return tree.Truth(True)
         if not isinstance(node, Mapping):
             self.refuse(f"the condition '{node}'", entry.get("provenance"))
         kind, inside = next(iter(node.items()))
@@ -112,28 +93,28 @@ class RumocaExpressions:
         if kind == "clock":
             return self._clock(inside)
         if kind == "not":
-            return Unary("not", self.condition(inside))
+            return tree.Unary("not", self.condition(inside))
         if kind in ("and", "or"):
-            return Binary(kind, self.condition(inside["lhs"]), self.condition(inside["rhs"]))
+            return tree.Binary(kind, self.condition(inside["lhs"]), self.condition(inside["rhs"]))
         if kind == "any_rise":
             parts = [self.condition(inside[side]) for side in ("lhs", "rhs")]
-            return Array(tuple(p for e in parts for p in (e.entries if isinstance(e, Array) else (e,))))
+            return tree.Array(tuple(p for e in parts for p in (e.entries if isinstance(e, tree.Array) else (e,))))
         self.refuse(f"a condition of the kind '{kind}'", entry.get("provenance"))
 
-    def _clock(self, number: int) -> Expression:
+    def _clock(self, number: int) -> tree.Expression:
         clock = self.storage["clocks"][number]
         lattice = clock["kind"].get("periodic", {}).get("lattice")
         if lattice is None:
             self.refuse(f"a clock of the kind '{next(iter(clock['kind']))}'", clock.get("provenance"))
-        phase, period = (Number(lattice[k]["num"] / lattice[k]["den"]) for k in ("phase", "period"))
-        return Call("sample", (phase, period), ())
+        phase, period = (tree.Number(lattice[k]["num"] / lattice[k]["den"]) for k in ("phase", "period"))
+        return tree.Call("sample", (phase, period), ())
 
     # --- expressions -------------------------------------------------------------------------------------------------
 
-    def variable(self, number: int, subscripts: tuple[Expression, ...] = ()) -> Reference:
-        return Reference((self.variables[number]["name"],), (subscripts,))
+    def variable(self, number: int, subscripts: tuple[tree.Expression, ...] = ()) -> tree.Reference:
+        return tree.Reference((self.variables[number]["name"],), (subscripts,))
 
-    def expression(self, number: int, places: Places) -> Expression:
+    def expression(self, number: int, places: Places) -> tree.Expression:
         if number not in self.nodes:
             raise ModelError(f"{self.name}: the dictionary has no expression {number}, but reads it")
         kind, inside, first, where = self.nodes[number]
@@ -148,11 +129,11 @@ class RumocaExpressions:
                 if inside["operator"] == "plus"
                 else _negated(e)
                 if inside["operator"] == "negate"
-                else Unary("not", e)
+                else tree.Unary("not", e)
             )
         if kind == "binary":
             sides = (self.expression(inside["lhs"], places), self.expression(inside["rhs"], places))
-            return _change(Binary(_BINARY[inside["operator"]], *sides))
+            return _change(tree.Binary(_BINARY[inside["operator"]], *sides))
         if kind == "index":
             return self._indexed(inside, first, places)
         if kind == "comprehension":
@@ -160,95 +141,99 @@ class RumocaExpressions:
             return self._comprehended(own, inside["body"], places)
         if kind == "field":
             field = self.types[self._record_type(inside["base"])]["record_fields"][inside["field"]]["name"]
-            return Part(self.expression(inside["base"], places), field, ())
+            return tree.Part(self.expression(inside["base"], places), field, ())
         if kind == "function_value":
-            return Reference((self._names(inside["function"])[inside["value"]],))
+            return tree.Reference((self._names(inside["function"])[inside["value"]],))
         if kind == "call":
             _, owner, first, _ = self.nodes[inside["owner"]]
             arguments = self._arguments(owner, first, places)
-            return Call(self._function_name(inside["function"], inside["output"]), arguments, ())
+            return tree.Call(self._function_name(inside["function"], inside["output"]), arguments, ())
         if kind == "array_update":
             return self._updated(number)
         if kind == "runtime_quotient_owner":
             sides = (self.expression(inside["lhs"], places), self.expression(inside["rhs"], places))
-            return Call(inside["builtin"], sides, ())
+            return tree.Call(inside["builtin"], sides, ())
         if kind not in ("conditional", "array", "builtin", "record"):
             self.refuse(f"an expression of the kind '{kind}'", where)
         arguments = self._arguments(inside, first, places)
         if kind == "conditional":
             pairs = zip(arguments[:-1:2], arguments[1::2], strict=True)
-            return Choice(tuple(pairs), arguments[-1])
+            return tree.Choice(tuple(pairs), arguments[-1])
         if kind == "array":
-            return Array(arguments)
+            return tree.Array(arguments)
         if kind == "record":
-            return Call(self.types[inside["value_type"]]["record_name"], arguments, ())
+            return tree.Call(self.types[inside["value_type"]]["record_name"], arguments, ())
         if inside["builtin"].startswith("promoted_cat"):
-            parts = (Call("promote", (a, Number(2)), ()) for a in arguments)
-            return Call("cat", (Number(int(inside["builtin"][-1])), *parts), ())
+            parts = (tree.Call("promote", (a, tree.Number(2)), ()) for a in arguments)
+            return tree.Call("cat", (tree.Number(int(inside["builtin"][-1])), *parts), ())
         builtin: str = inside["builtin"]
-        return Call(_BUILTIN.get(builtin, builtin), arguments, ())
+        return tree.Call(_BUILTIN.get(builtin, builtin), arguments, ())
 
-    def _arguments(self, inside: Json, first: int, places: Places) -> tuple[Expression, ...]:
+    def _arguments(self, inside: Json, first: int, places: Places) -> tuple[tree.Expression, ...]:
         return tuple(self.expression(k, places) for k in self.operands[first : first + inside["operand_count"]])
 
-    def _coordinate(self, c: Any, subscripts: tuple[Expression, ...], places: Places, where: Json) -> Expression:
+    def _coordinate(
+        self, c: Any, subscripts: tuple[tree.Expression, ...], places: Places, where: Json
+    ) -> tree.Expression:
         if c == "time":
-            return Reference(("time",))
+            return tree.Reference(("time",))
         if not isinstance(c, Mapping):
             self.refuse(f"'{c}'", where)
         kind, inside = next(iter(c.items()))
         if kind in VARIABLE:
             return self.variable(inside, subscripts)
         if kind == "derivative":
-            return Call("der", (self.variable(inside, subscripts),), ())
+            return tree.Call("der", (self.variable(inside, subscripts),), ())
         if kind.startswith("pre_") and kind[4:] in VARIABLE:
-            return Call("pre", (self.variable(inside, subscripts),), ())
+            return tree.Call("pre", (self.variable(inside, subscripts),), ())
         if kind == "condition":
             return self.condition(inside)
         if kind == "terminal":
-            return Call("terminal", (), ())
+            return tree.Call("terminal", (), ())
         if kind == "binder":
             key = inside["domain"], inside["ordinal"]
-            return Number(places[key]) if key in places else Reference((_binder(*key),))
+            return tree.Number(places[key]) if key in places else tree.Reference((_binder(*key),))
         if kind == "function_parameter":
             name = self.functions[inside["function"]]["parameters"][inside["ordinal"]]["name"]
-            return Reference((name,), (subscripts,))
+            return tree.Reference((name,), (subscripts,))
         if kind == "delay":
-            return Call("delay", (), ())
+            return tree.Call("delay", (), ())
         self.refuse(f"'{kind}'", where)
 
-    def _indexed(self, inside: Json, first: int, places: Places) -> Expression:
-        subscripts: list[Expression] = []
+    def _indexed(self, inside: Json, first: int, places: Places) -> tree.Expression:
+        subscripts: list[tree.Expression] = []
         for s in self.subscripts[first : first + inside["subscript_count"]]:
             if s["kind"] == "whole":
-                subscripts.append(Whole())
+                subscripts.append(tree.Whole())
             else:
                 subscripts.append(self.expression(next(iter(s["kind"].values())), places))
         kind, base, _, where = self.nodes[inside["base"]]
         if kind == "coordinate" and base != "time":
             return self._coordinate(base, tuple(subscripts), places, where)
-        return Part(self.expression(inside["base"], places), None, tuple(subscripts))
+        return tree.Part(self.expression(inside["base"], places), None, tuple(subscripts))
 
-    def _comprehended(self, binders: Sequence[tuple[tuple[int, int], range]], body: int, places: Places) -> Expression:
+    def _comprehended(
+        self, binders: Sequence[tuple[tuple[int, int], range]], body: int, places: Places
+    ) -> tree.Expression:
         if not binders:
             return self.expression(body, places)
         (key, values), *rest = binders
-        return Array(tuple(self._comprehended(rest, body, {**places, key: v}) for v in values))
+        return tree.Array(tuple(self._comprehended(rest, body, {**places, key: v}) for v in values))
 
-    def _updated(self, number: int) -> Expression:
+    def _updated(self, number: int) -> tree.Expression:
         """An array of a function with one entry changed, whose place is constant."""
         _, inside, first, where = self.nodes[number]
         whole = self.expression(inside["base"], {})
         subscript = self.subscripts[first]["kind"]
         place = self.expression(subscript["index"], {}) if "index" in subscript else None
-        if isinstance(whole, Reference):
+        if isinstance(whole, tree.Reference):
             size = self.types[self._value_type(self.nodes[inside["base"]][1])]["dimensions"][0]
-            whole = Array(tuple(Reference(whole.parts, ((Number(k + 1),),)) for k in range(size)))
-        if not isinstance(whole, Array) or not isinstance(place, Number) or inside["subscript_count"] != 1:
+            whole = tree.Array(tuple(tree.Reference(whole.parts, ((tree.Number(k + 1),),)) for k in range(size)))
+        if not isinstance(whole, tree.Array) or not isinstance(place, tree.Number) or inside["subscript_count"] != 1:
             self.refuse("a changed entry of an array of several dimensions, or at a place that is not constant,", where)
         entries = list(whole.entries)
         entries[int(place.value) - 1] = self.expression(inside["value"], {})
-        return Array(tuple(entries))
+        return tree.Array(tuple(entries))
 
     def _value_type(self, inside: Json) -> int:
         """The type of a result or local variable of a function."""
@@ -282,7 +267,7 @@ class RumocaExpressions:
             f["name"] if f.get("external") is not None else f"{f['name']}:{function}" + (f".{output}" if output else "")
         )
 
-    def _function(self, function: int, output: int) -> Class:
+    def _function(self, function: int, output: int) -> tree.Class:
         """A function whose first result is the given one."""
         f = self.functions[function]
         outputs = sorted(f["outputs"], key=lambda o: o is not f["outputs"][output])
@@ -295,7 +280,7 @@ class RumocaExpressions:
             "function", self._function_name(function, output), declared, algorithm=body, external=external
         )
 
-    def _statement(self, function: int, statement: Json) -> Iterator[Statement]:
+    def _statement(self, function: int, statement: Json) -> Iterator[tree.Statement]:
         kind, inside = next(iter(statement.items()))
         names = self._names(function)
         line = self.line(inside.get("provenance"))
@@ -304,28 +289,28 @@ class RumocaExpressions:
         elif kind == "assignment_group":  # all of them read what was before the first
             each = inside["assignments"]
             for k, a in enumerate(each):
-                yield Assignment(Reference((f":{k}",)), self.expression(a["rhs"], {}), line)
+                yield tree.Assignment(tree.Reference((f":{k}",)), self.expression(a["rhs"], {}), line)
             for k, a in enumerate(each):
-                yield Assignment(Reference((names[a["target"]],)), Reference((f":{k}",)), line)
+                yield tree.Assignment(tree.Reference((names[a["target"]],)), tree.Reference((f":{k}",)), line)
         elif kind == "for":
             ranges = [
-                (_binder(*key), Range(Number(r.start), Number(r.step), Number(r.stop - 1)))
+                (_binder(*key), tree.Range(tree.Number(r.start), tree.Number(r.step), tree.Number(r.stop - 1)))
                 for key, r in self.binders(inside["domain"])
                 if key[0] == inside["domain"]
             ]
             body = [s for each in inside["statements"] for s in self._statement(function, each)]
-            yield Loop(tuple(ranges), None, tuple(body), line)
+            yield tree.Loop(tuple(ranges), None, tuple(body), line)
         else:
             self.refuse(f"a statement of the kind '{kind}'", inside.get("provenance"))
 
-    def _assignment(self, target: str, rhs: int, line: int) -> Assignment:
+    def _assignment(self, target: str, rhs: int, line: int) -> tree.Assignment:
         """An assignment to a variable, or to one entry of it."""
         kind, inside, first, _ = self.nodes[rhs]
         if kind == "array_update" and self.nodes[inside["base"]][0] == "function_value":
             place = self._indexed({"base": inside["base"], "subscript_count": inside["subscript_count"]}, first, {})
-            subscripts = place.subscripts if isinstance(place, Part) else ()
-            return Assignment(Reference((target,), (subscripts,)), self.expression(inside["value"], {}), line)
-        return Assignment(Reference((target,)), self.expression(rhs, {}), line)
+            subscripts = place.subscripts if isinstance(place, tree.Part) else ()
+            return tree.Assignment(tree.Reference((target,), (subscripts,)), self.expression(inside["value"], {}), line)
+        return tree.Assignment(tree.Reference((target,)), self.expression(rhs, {}), line)
 
     # --- places in the source ----------------------------------------------------------------------------------------
 
@@ -355,40 +340,40 @@ class _Lines:
 
 
 def flat_class(
-    kind: str, name: str, declarations: Iterable[Declaration], equations: Iterable[Statement] = (),
-    initial: Iterable[Statement] = (), algorithm: Sequence[Statement] = (), external: str | None = None,
-) -> Class:  # fmt: skip
-    return Class(
+    kind: str, name: str, declarations: Iterable[tree.Declaration], equations: Iterable[tree.Statement] = (),
+    initial: Iterable[tree.Statement] = (), algorithm: Sequence[tree.Statement] = (), external: str | None = None,
+) -> tree.Class:  # fmt: skip
+    return tree.Class(
         kind, name, tuple(declarations), tuple(equations), tuple(initial), (tuple(algorithm),) if algorithm else (),
         external=external,
     )  # fmt: skip
 
 
-def _declared(prefixes: frozenset[str], name: str, of: Json) -> Declaration:
+def _declared(prefixes: frozenset[str], name: str, of: Json) -> tree.Declaration:
     """A parameter or variable of a function, or a field of a record."""
     kind = of.get("record_name") or SCALAR[of["scalar"]]
-    return Declaration(prefixes, kind, name, tuple(map(Number, of["dimensions"])), {}, None, "", 0)
+    return tree.Declaration(prefixes, kind, name, tuple(map(tree.Number, of["dimensions"])), {}, None, "", 0)
 
 
-def _literal(value: Json) -> Expression:
+def _literal(value: Json) -> tree.Expression:
     kind, inside = next(iter(value.items()))
     if kind == "boolean":
-        return Truth(inside)
-    return Text(inside) if kind == "string" else Number(inside)
+        return tree.Truth(inside)
+    return tree.Text(inside) if kind == "string" else tree.Number(inside)
 
 
-def _negated(e: Expression) -> Expression:
-    return Number(-e.value) if isinstance(e, Number) else Unary("-", e)
+def _negated(e: tree.Expression) -> tree.Expression:
+    return tree.Number(-e.value) if isinstance(e, tree.Number) else tree.Unary("-", e)
 
 
-def _change(e: Binary) -> Expression:
+def _change(e: tree.Binary) -> tree.Expression:
     """`edge(b)` and `change(b)`, which rumoca writes with `pre(b)`."""
-    other = e.right.operand if isinstance(e.right, Unary) and e.right.operator == "not" else e.right
-    if isinstance(other, Call) and other.function == "pre" and other.arguments == (e.left,):
+    other = e.right.operand if isinstance(e.right, tree.Unary) and e.right.operator == "not" else e.right
+    if isinstance(other, tree.Call) and other.function == "pre" and other.arguments == (e.left,):
         if e.operator == "<>" and other is e.right:
-            return Call("change", other.arguments, ())
+            return tree.Call("change", other.arguments, ())
         if e.operator == "and" and other is not e.right:
-            return Call("edge", other.arguments, ())
+            return tree.Call("edge", other.arguments, ())
     return e
 
 
