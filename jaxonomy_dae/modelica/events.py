@@ -190,12 +190,7 @@ def write_when(scope: Scope, s: tree.Branches) -> None:
 
 
 def _event(
-    scope: Scope,
-    condition: tree.Expression,
-    body: tuple[tree.Statement, ...],
-    chain: list,
-    more: list[Any],
-    among: bool,
+    scope: Scope, condition: tree.Expression, body: tuple[tree.Statement, ...], chain: list, more: list, among: bool
 ) -> Rise | None:
     """Adds one event, with `more` actions; for a branch `among` others, returns what its event rests on instead.
     Branches of clocks and of the initial time are events of their own; a clock's does not act where a branch before it
