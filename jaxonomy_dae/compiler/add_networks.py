@@ -146,7 +146,7 @@ def _extended(variables: VariableTable, names: list[str], first_internal: int) -
     extra = len(names) - len(variables)
     no = np.zeros(extra, bool)
     return VariableTable(
-        names=names,
+        names=variables.names.followed_by(names[len(variables) :]),
         is_input=np.append(variables.is_input, no),
         is_port=np.append(variables.is_port, no),
         start=variables.start.padded(extra),

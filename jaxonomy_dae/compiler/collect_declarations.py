@@ -8,6 +8,7 @@ import sympy
 from jax.typing import DTypeLike
 
 from ..errors import ModelError
+from ..model.names import Names
 from ..model.starts import Formulas, Starts
 from ..model.symbolic import SymbolicTemplate, canonical
 from ..model.tables import ParameterTable, VariableTable, complete
@@ -111,25 +112,20 @@ def _parameters(model: ModelNumbers, members: Sequence[tuple[Instances, int]], p
 
 def parameter_table(model: ModelNumbers) -> tuple[ParameterTable, np.ndarray]:
     """The declarations of all parameters, and their values."""
-    n = model.n_parameters
-    names, units, bounds = [""] * n, [""] * n, [Interval()] * n
+    n, names = model.n_parameters, model.parameter_names
+    units, bounds = np.empty((2, n), object)
     values = np.zeros(n)
     reads: dict[int, tuple[sympy.Expr, list[int]]] = {}  # of the dependent ones: the expression, what it reads
     for i in model.instances:
         for k, parameter in enumerate(i.component.parameters.values()):
-            value, ids = parameter.value, (i.parameter + k).tolist()
-            for p, c in zip(ids, i.number.tolist(), strict=True):
-                names[p], units[p], bounds[p] = f"{model.paths[c]}.{parameter.name}", parameter.unit, parameter.bounds
+            value, at = parameter.value, i.parameter + k
+            units[at], bounds[at] = parameter.unit, parameter.bounds
             if isinstance(value, sympy.Expr):
                 symbols: list[Any] = sorted(value.free_symbols, key=lambda s: s.path)  # type: ignore
                 columns = np.stack([model.parameter(i, s.path) for s in symbols], axis=1)
-                reads.update((p, (value, row)) for p, row in zip(ids, columns.tolist(), strict=True))
-            elif isinstance(value, EachValue):
-                values[ids] = value.values[_place_in(value, i)]
-            elif len(ids) == 1:
-                values[ids[0]] = value
+                reads.update((p, (value, row)) for p, row in zip(at.tolist(), columns.tolist(), strict=True))
             else:
-                values[ids] = value
+                values[at] = value.values[_place_in(value, i)] if isinstance(value, EachValue) else value
     expressions: dict[int, str] = {}
     for p, (value, ids) in sorted(reads.items()):
         symbols = sorted(value.free_symbols, key=lambda s: s.path)  # type: ignore
@@ -145,13 +141,13 @@ def parameter_table(model: ModelNumbers) -> tuple[ParameterTable, np.ndarray]:
     # Beside what was declared: hidden discrete variables, such as relations that are events, and what discrete
     # variables were before an event.
     n_relations = len(model.relations)
-    names += [f"relation {k}" for k in range(n_relations)]
+    names = names.followed_by([f"relation {k}" for k in range(n_relations)])
     starts = np.zeros(n_relations)
     for i in model.instances:
         starts[i.relation[:, None] - model.n_parameters + np.arange(len(i.component.relations))] = i.component.relations
     n_more = n_relations + len(model.discrete)
     table = ParameterTable(
-        [*names, *(f"pre({names[p]})" for p in model.discrete)],
+        names.followed_by([f"pre({names[p]})" for p in model.discrete.tolist()]),
         [*units, *[""] * n_more],
         [*bounds, *[Interval()] * n_more],
         dependents,
@@ -172,7 +168,7 @@ def _place_in(value: EachValue, i: Instances) -> np.ndarray:
 
 
 def _dependent_parameters(
-    reads: dict[int, tuple[sympy.Expr, list[int]]], expressions: dict[int, str], names: list[str]
+    reads: dict[int, tuple[sympy.Expr, list[int]]], expressions: dict[int, str], names: Names
 ) -> tuple[Formulas, ...]:
     """Groups of equal templates, in an order in which everything that one reads is known."""
     groups: list[Formulas] = []

@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..errors import ModelError
 from ..model.linear_template import LinearTemplate
+from ..model.names import Names
 from ..model.provenance import Provenance, Provenances
 from ..model.tables import EquationGroup, PortTable
 from ..modeling.arrays import PortArray
@@ -24,7 +25,7 @@ NAMED = 4  # ports of a junction, in messages
 class _Ports:
     """The ports of a model, by id."""
 
-    names: list[str]
+    names: Names
     domains: list[Domain]  # that occur
     domain: np.ndarray
     owner: np.ndarray  # the component
@@ -36,7 +37,7 @@ class _Ports:
 class Junctions:
     """Source of provenances: entry `junction * width + k` is the equation for the k-th variable of the domain."""
 
-    names: list[str]
+    names: Names
     domains: list[Domain]
     domain: np.ndarray  # of each port
     port: np.ndarray  # the ports that meet, junction by junction
@@ -99,7 +100,6 @@ def _list_ports(model: ModelNumbers) -> _Ports:
     for shape, _ in shapes:
         for _, d in shape:
             numbers.setdefault(d, len(numbers))
-    names = [""] * model.n_ports
     domain, owner = np.empty(model.n_ports, np.int64), np.empty(model.n_ports, np.int64)
     width = max((len(d.across) + len(d.through) for d in numbers), default=1)
     variable = np.full((model.n_ports, width), -1, np.int64)
@@ -107,12 +107,10 @@ def _list_ports(model: ModelNumbers) -> _Ports:
         first, number = np.concatenate([i.port for i in parts]), np.concatenate([i.number for i in parts])
         variables = np.concatenate([i.variable for i in parts])
         for j, (name, d) in enumerate(shape):
-            for k, c in zip((first + j).tolist(), number.tolist(), strict=True):
-                names[k] = f"{model.paths[c]}.{name}"
             domain[first + j], owner[first + j] = numbers[d], number
             places = [parts[0].variable_positions[f"{name}.{n}"] for n, _ in (*d.across, *d.through)]
             variable[(first + j)[:, None], np.arange(len(places))] = variables[:, None] + np.array(places)
-    return _Ports(names, list(numbers), domain, owner, variable, position)
+    return _Ports(model.port_names, list(numbers), domain, owner, variable, position)
 
 
 def _joined_faces(model: ModelNumbers, diagram: AcausalDiagram, ports: _Ports) -> tuple[np.ndarray, np.ndarray]:

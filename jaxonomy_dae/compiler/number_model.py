@@ -2,13 +2,14 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import cast
 
 import numpy as np
 
 from ..errors import ModelError, nearest
 from ..model.array_names import ArrayEntry, ArrayNames
+from ..model.names import Names, Paths
 from ..modeling.arrays import ComponentArray
 from ..modeling.component import Component
 from ..modeling.declarations import around_path
@@ -63,7 +64,7 @@ class ModelNumbers:
         self._positions: dict[tuple[str, ...], dict[str, int]] = {}
         self._number(self._counted())
         self.of: dict[int, Instances] = {id(i.component): i for i in self.instances}
-        self.paths: list[str] = self._paths()
+        self.paths = Paths(self._paths())
         # After all parameters follow the hidden discrete variables, then what discrete variables were before an event,
         # in the order of these.
         flagged = [np.zeros(0, np.int64)]
@@ -154,16 +155,36 @@ class ModelNumbers:
         return paths
 
     @functools.cached_property
-    def variable_names(self) -> list[str]:
+    def variable_names(self) -> Names:
         """The full names of all variables, by id."""
-        names = [""] * self.n_variables
-        for i in self.instances:
-            paths = [self.paths[c] for c in i.number.tolist()]
-            for k, name in enumerate(i.component.variables):
-                before, after = around_path(name)
-                for v, path in zip((i.variable + k).tolist(), paths, strict=True):
-                    names[v] = before + path + after
-        return names
+        own = [(i.variable, map(around_path, i.component.variables)) for i in self.instances]
+        return self._names(own, self.n_variables)
+
+    @functools.cached_property
+    def parameter_names(self) -> Names:
+        """The full names of all declared parameters, by id."""
+        own = [(i.parameter, (("", f".{name}") for name in i.component.parameters)) for i in self.instances]
+        return self._names(own, self.n_parameters)
+
+    @functools.cached_property
+    def port_names(self) -> Names:
+        """The full names of all ports, by id."""
+        own = [(i.port, (("", f".{port.name}") for port in i.component.ports.values())) for i in self.instances]
+        return self._names(own, self.n_ports)
+
+    def _names(self, own: Sequence[tuple[np.ndarray, Iterable[tuple[str, str]]]], n: int) -> Names:
+        """The names of what components declare: for each of `instances`, the first id of each and the texts around its
+        path."""
+        owner, piece, pieces = np.empty(n, np.int32), np.empty(n, np.int32), {}
+        for i, (first, texts) in zip(self.instances, own, strict=True):
+            numbers = [pieces.setdefault(text, len(pieces)) for text in texts]
+            if len(i) == 1:
+                inside = slice(int(first[0]), int(first[0]) + len(numbers))
+                owner[inside], piece[inside] = i.number[0], numbers
+            elif numbers:
+                at = first[:, None] + np.arange(len(numbers))
+                owner[at], piece[at] = i.number[:, None], numbers
+        return Names(self.paths, owner, piece, tuple(pieces))
 
     def _position(self, names: tuple[str, ...]) -> dict[str, int]:
         return self._positions.setdefault(names, {n: k for k, n in enumerate(names)})

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import lineax as lx
@@ -18,7 +18,7 @@ from ..model.extended import Extended
 from ..model.identity import Identity
 from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
-from ..model.quantities import QuantityMap, ReducedModel
+from ..model.quantities import QuantityMap, QuantityNames, ReducedModel
 from ..model.tables import ZERO, FlatModel, provenance_of
 from ..structure.integers import distinct
 from . import pattern
@@ -159,12 +159,12 @@ class SystemPlan:
         return self.model.extended
 
     @property
-    def quantity_name(self) -> tuple[str, ...]:
+    def quantity_name(self) -> QuantityNames:
         """A user's name for every quantity."""
         return self.model.names
 
     @property
-    def variable_index(self) -> dict[str, int]:
+    def variable_index(self) -> Mapping[str, int]:
         """The number of every variable by name."""
         return self.flat.variables.index
 

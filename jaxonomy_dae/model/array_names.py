@@ -1,7 +1,7 @@
 """What a name without indices means in a model with arrays of components: `cell.v` is all of `cell[0].v`, …"""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -94,7 +94,7 @@ def inner_name(name: str) -> tuple[int, str]:
     return order, name
 
 
-def one_by_one(arrays: ArrayNames, names: list[str], initial: object) -> Any:
+def one_by_one(arrays: ArrayNames, names: Sequence[str], initial: object) -> Any:
     """Initial values by name, with those of arrays of variables under the names of their entries: a number for all, or
     an array of the same shape.
 

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
+from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -31,23 +33,39 @@ def map_quantities(alias: AliasTable, quantities: Quantities) -> QuantityMap:
     return QuantityMap(np.where(alias.root == ZERO, ZERO, quantity), alias.factor)
 
 
-def name_quantities(flat: FlatModel, variables: QuantityMap, quantities: Quantities) -> list[str]:
+class QuantityNames(Sequence[str]):
     """A user's name for every quantity: of a variable that equals it, best not of a port; a quantity that equals no
     variable is the derivative of one."""
-    order, table = quantities.order, flat.variables
-    v = np.flatnonzero((variables.quantity >= 0) & (variables.factor == 1))
-    q = variables.quantity[v]
-    is_root = (order[q] == 0) & (quantities.variable[quantities.owner[q]] == v)
-    sorting = np.lexsort((v, ~is_root, table.is_port[v], table.is_internal[v], q))
-    named, first = np.unique(q[sorting], return_index=True)
-    names: list[str] = [""] * quantities.n
-    for k, best in zip(named.tolist(), v[sorting[first]].tolist(), strict=True):
-        names[k] = table.names[best]
-    unnamed = np.ones(quantities.n, bool)
-    unnamed[named] = False
-    for k in np.flatnonzero(unnamed).tolist():
-        names[k] = f"der({names[k - 1]})"
-    return names
+
+    def __init__(self, flat: FlatModel, variables: QuantityMap, quantities: Quantities):
+        self._flat, self._variables, self._quantities = flat, variables, quantities
+
+    @functools.cached_property
+    def _best(self) -> np.ndarray:
+        """The variable that names each quantity, −1 for derivatives of others."""
+        order, table, variables = self._quantities.order, self._flat.variables, self._variables
+        v = np.flatnonzero((variables.quantity >= 0) & (variables.factor == 1))
+        q = variables.quantity[v]
+        is_root = (order[q] == 0) & (self._quantities.variable[self._quantities.owner[q]] == v)
+        sorting = np.lexsort((v, ~is_root, table.is_port[v], table.is_internal[v], q))
+        named, first = np.unique(q[sorting], return_index=True)
+        best = np.full(self._quantities.n, -1)
+        best[named] = v[sorting[first]]
+        return best
+
+    @overload
+    def __getitem__(self, index: slice) -> list[str]: ...
+    @overload
+    def __getitem__(self, index: Any) -> str: ...
+    def __getitem__(self, index):
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        index = range(len(self))[index]
+        v = int(self._best[index])
+        return self._flat.variables.names[v] if v >= 0 else f"der({self[index - 1]})"
+
+    def __len__(self):
+        return self._quantities.n
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,9 +79,9 @@ class ReducedModel:
     variables: QuantityMap
 
     @functools.cached_property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> "QuantityNames":
         """A user's name for every quantity."""
-        return tuple(name_quantities(self.flat, self.variables, self.extended.quantities))
+        return QuantityNames(self.flat, self.variables, self.extended.quantities)
 
     def text(self, equation: int) -> str:
         """The text of an equation as written."""

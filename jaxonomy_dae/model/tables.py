@@ -5,8 +5,7 @@ of integers. After alias elimination a slot also has a factor, and variable −1
 """
 
 import dataclasses
-import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,6 +15,7 @@ from ..modeling.interval import Interval
 from .array_names import ArrayNames
 from .events import NO_EVENTS, NONE_HELD, EventTable, HeldTable
 from .group import Group
+from .names import Names, Paths
 from .opaque import OpaqueFunction
 from .provenance import Provenance, Provenances
 from .starts import Formulas, Starts
@@ -29,7 +29,7 @@ ZERO = -1  # stands for a variable, or quantity, that is identically zero
 class VariableTable:
     """The declarations of all variables, by id."""
 
-    names: list[str]
+    names: Names
     is_input: np.ndarray
     is_port: np.ndarray
     start: Starts
@@ -49,10 +49,10 @@ class VariableTable:
         """True for across variables of ports."""
         return self.potential >= 0
 
-    @functools.cached_property
-    def index(self) -> dict[str, int]:
+    @property
+    def index(self) -> Mapping[str, int]:
         """The number of every variable by name."""
-        return {name: k for k, name in enumerate(self.names)}
+        return self.names.number
 
     def __len__(self):
         return len(self.names)
@@ -62,7 +62,7 @@ class VariableTable:
 class PortTable:
     """The ports of the model, by id: full names, domains, and whether they are connected from outside and inside."""
 
-    names: list[str]
+    names: Names
     domains: list[str]
     owner: np.ndarray  # the component
     is_loose: np.ndarray
@@ -77,7 +77,7 @@ class PortTable:
 class ParameterTable:
     """The declarations of all parameters, by id."""
 
-    names: list[str]
+    names: Names
     units: list[str]
     bounds: list[Interval]
     dependents: tuple[Formulas, ...]  # each reads only what those before it have computed
@@ -172,7 +172,7 @@ class FlatModel:
     declared: Declared | None  # None in a plan, which is structure alone
     network_names: tuple[str, ...]
     rows: tuple[RowInjection, ...]
-    components: list[str]  # full names, by id
+    components: Paths  # full names, by id
     ports: PortTable
     name: str = ""  # of the diagram
     events: EventTable = NO_EVENTS

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..errors import ModelError, nearest
 from ..model.array_names import ArrayNames
+from ..model.names import Names
 from ..model.starts import Formulas
 from ..model.tables import complete
 from ..modeling.interval import Interval, closed_ends
@@ -28,7 +29,7 @@ from .sections import HTML_SHOWN, SHOWN
 class ParameterNames:
     """The name table: static, compared by its digest."""
 
-    names: list[str] = dataclasses.field(compare=False, hash=False)
+    names: Names = dataclasses.field(compare=False, hash=False)
     units: list[str] = dataclasses.field(compare=False, hash=False)
     intervals: list[Interval] = dataclasses.field(compare=False, hash=False)
     dependents: tuple[Formulas, ...] = dataclasses.field(compare=False, hash=False)
@@ -36,19 +37,15 @@ class ParameterNames:
     arrays: ArrayNames = dataclasses.field(default_factory=ArrayNames, compare=False, hash=False)
     digest: str = ""
 
-    @functools.cached_property
-    def _index(self) -> dict[str, int]:
-        return {n: k for k, n in enumerate(self.names)}
-
     def index(self, name: str) -> int:
-        found = self._index.get(name)
+        found = self.names.number.get(name)
         if found is None:
             raise ModelError(f"'{name}' is not a parameter: " + nearest(name, self.names))
         return found
 
     def entries(self, name: str) -> np.ndarray | None:
         """The indices of the parameters behind the name of an array, in its shape; None if it is not that of one."""
-        return None if name in self._index else self.arrays.parameters(name)
+        return None if name in self.names else self.arrays.parameters(name)
 
     def one_by_one(self, name: str) -> list[str]:
         """The names of the entries of an array of parameters; the name itself if it is not that of one."""
@@ -201,7 +198,7 @@ class Parameters(eqx.Module):
         return picked(part, (..., place))
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and (name in self.table._index or self.table.entries(name) is not None)
+        return isinstance(name, str) and (name in self.table.names or self.table.entries(name) is not None)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.table.names)
