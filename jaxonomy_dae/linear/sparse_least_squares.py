@@ -7,8 +7,11 @@ Tikhonov's x = (AᵀA + δ)⁻¹Aᵀb solves the augmented system
 
 whose matrix is regular for every A, and sparse if A is. Repeated with what is left of b, x tends to the least-squares
 solution of least norm (iterated Tikhonov regularization; Engl, Hanke & Neubauer 1996, section 5.1).
+
+A square matrix that is far from singular has one solution, which its own factors give in a fifth of the time.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,6 +23,7 @@ from jaxtyping import Float
 # the residual in directions that A leaves open, which the repetitions take out of b, not out of x.
 REGULARIZATION = 1e-10
 REPETITIONS = 3
+STEPS = 4  # after which a random vector of 10⁵ entries shows a single small singular value to a factor of ten
 
 
 class SparseLeastSquares:
@@ -28,14 +32,34 @@ class SparseLeastSquares:
     def __init__(self, matrix: Any):
         self.matrix: Any = sp.csr_array(matrix)
         m, n = self.matrix.shape
+        self._regular = regular_factors(self.matrix) if m == n else None
+        if self._regular is not None:
+            return
         one, ridge = sp.eye_array(m), REGULARIZATION * sp.eye_array(n)
         augmented: Any = sp.block_array([[one, self.matrix], [self.matrix.T, -ridge]], format="csc")
         self._factors = scipy.sparse.linalg.splu(augmented)
 
     def solve(self, right: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
         """The least-squares solution of A·x = b, of least norm."""
+        if self._regular is not None:
+            return self._regular(right)
         m, n = self.matrix.shape
         x = np.zeros(n)
         for _ in range(REPETITIONS):
             x = x + self._factors.solve(np.concatenate([right - self.matrix @ x, np.zeros(n)]))[m:]
         return x
+
+
+def regular_factors(matrix: Any) -> Callable[[np.ndarray], np.ndarray] | None:
+    """The solution for right-hand sides, given a square sparse matrix with entries near one; None if the matrix has
+    a singular value that least squares would leave out."""
+    try:
+        factors = scipy.sparse.linalg.splu(sp.csc_array(matrix))
+    except RuntimeError:  # exactly singular
+        return None
+    x, size = np.random.default_rng(0).normal(size=matrix.shape[0]), 1.0
+    with np.errstate(all="ignore"):
+        for _ in range(STEPS):  # of the power method for the inverse of AᵀA
+            x = factors.solve(factors.solve(x / np.linalg.norm(x), "T"))
+            size = np.linalg.norm(x)
+    return factors.solve if size < 1 / REGULARIZATION else None

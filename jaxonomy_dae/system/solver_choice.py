@@ -1,12 +1,13 @@
 """Which solver suits a compiled system: by what the compiler knows, and by how fast it decays at its declared start."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
 from ..judgement.scaling import equilibrated
-from ..linear.sparse_least_squares import SparseLeastSquares
+from ..linear.sparse_least_squares import SparseLeastSquares, regular_factors
 from ..lowering.plan import SystemPlan
 from ..model.consistent_point import initial_point
 from ..model.jacobian import residual_and_jacobian
@@ -123,15 +124,13 @@ def _fast_rates(matrix: Any, below: np.ndarray) -> np.ndarray:
     """The eigenvalues of largest size, by Arnoldi's method: N' N⁺ has those of N⁺ N', and takes v to the derivatives of
     the quantities nearest to v among those for which the equations hold, linearised."""
     scaled, _, unit = equilibrated(matrix)
-    chosen = sp.csr_array((np.ones(len(below)), (np.arange(len(below)), below)), shape=(len(below), matrix.shape[1]))
-    factors = SparseLeastSquares(sp.vstack([HOLDS * scaled, chosen]))
-    zero, per = np.zeros(matrix.shape[0]), unit[below + 1] / unit[below]
+    changes, per = _changes(scaled, below), unit[below + 1] / unit[below]
     steps = min(len(below), KRYLOV)
     basis, hessenberg = np.zeros((steps + 1, len(below))), np.zeros((steps + 1, steps))
     basis[0] = np.random.default_rng(0).normal(size=len(below))
     basis[0] /= np.linalg.norm(basis[0])
     for k in range(steps):
-        v = factors.solve(np.concatenate([zero, basis[k]]))[below + 1] * per
+        v = changes(basis[k]) * per
         for _ in range(2):  # twice is enough (Giraud et al. 2005)
             along = basis[: k + 1] @ v
             hessenberg[: k + 1, k] += along
@@ -143,3 +142,23 @@ def _fast_rates(matrix: Any, below: np.ndarray) -> np.ndarray:
         hessenberg[k + 1, k], basis[k + 1] = size, v / size
     found = hessenberg[:steps, :steps]
     return np.linalg.eigvals(found) if np.isfinite(found).all() else np.zeros(0)
+
+
+def _changes(matrix: Any, below: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """From v to the derivatives of the quantities `below` that are nearest to v among those for which the equations
+    hold, given their Jacobian."""
+    n = matrix.shape[1]
+    others = np.delete(np.arange(n), below)
+    solve = regular_factors(matrix[:, others]) if matrix.shape[0] == len(others) else None
+    if solve is not None:  # no equation constrains v
+        given, values = matrix[:, below], np.empty(n)
+
+        def change(v: np.ndarray) -> np.ndarray:
+            values[below], values[others] = v, -solve(given @ v)
+            return values[below + 1]
+
+        return change
+    chosen = sp.csr_array((np.ones(len(below)), (np.arange(len(below)), below)), shape=(len(below), n))
+    factors = SparseLeastSquares(sp.vstack([HOLDS * matrix, chosen]))
+    zero = np.zeros(matrix.shape[0])
+    return lambda v: factors.solve(np.concatenate([zero, v]))[below + 1]

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import scipy.sparse
 from problems import compiled, oscillator, pendulum, rc_circuit
 
 from jaxonomy_dae import Component, Eq, EqnEnv, der
+from jaxonomy_dae.linear.sparse_least_squares import SparseLeastSquares, regular_factors
 from jaxonomy_dae.system import solver_choice
 from jaxonomy_dae.system.solver_choice import fastest_decay as fastest_decay_of
 
@@ -68,3 +70,16 @@ def test_both_methods_agree(monkeypatch):
     by_singular_values = [fastest_decay(system) for system in systems]
     monkeypatch.setattr(solver_choice, "LARGE", 0)
     assert [fastest_decay(system) for system in systems] == pytest.approx(by_singular_values, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("least", [1.0, 1e-3, 1e-7, 0.0])
+def test_square_matrices_near_singular_are_left_to_least_squares(least):
+    """The factors of a square matrix serve where its singular values are those that least squares solve, too."""
+    rng = np.random.default_rng(1)
+    basis = np.linalg.qr(rng.normal(size=(60, 60)))[0]
+    matrix, x = basis * np.append(np.ones(59), least) @ basis.T, rng.normal(size=60)
+    solve = regular_factors(scipy.sparse.csr_array(matrix))
+    assert (solve is None) == (least < 1e-5)
+    if least != 1e-7:  # of which a regularized solution has a part
+        expected = x if least else x - basis[:, 59] @ x * basis[:, 59]
+        np.testing.assert_allclose(SparseLeastSquares(matrix).solve(matrix @ x), expected, rtol=1e-6, atol=1e-6)
