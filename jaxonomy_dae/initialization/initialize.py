@@ -48,7 +48,7 @@ class InitialPoint(NamedTuple):
     - `residual`, `limit`, `target`: of each row, the residual, the largest that counts as rounding, and the value the
         row should have had (zero for equations).
     - `method`: an index into `METHODS`; `evaluations`: their number.
-    - `jacobian`: that of the rows with respect to (x, solved).
+    - `jacobian`: that of the rows with respect to (x, solved); of sparse rows, the values at their places.
     """
 
     x: Any
@@ -293,7 +293,7 @@ def _large_point(problem: InitialProblem, sparse: SparseRows) -> InitialPoint:
     limit = jnp.where(problem.is_soft, jnp.inf, limit)
     return InitialPoint(
         x=w, solved=w[:0], residual=remaining, limit=limit, target=problem.full,
-        method=method, evaluations=evaluations, jacobian=None,
+        method=method, evaluations=evaluations, jacobian=values,
     )  # fmt: skip
 
 

@@ -6,10 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import scipy.sparse as sp
 
 from ..diagnosis.lost_cancellation import lost_cancellation
 from ..diagnosis.redundant_constraints import DependentConstraints, ModelAt, dependent_constraints, no_freedom
 from ..diagnosis.wording import listed
+from ..judgement.sparse_rank import sparse_rank_of
 from ..lowering.plan import SystemPlan
 from ..model.tables import ZERO
 from ..system.input_values import input_values
@@ -20,12 +22,12 @@ from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST
 from .rows import StartRow, initial_rows, supports
 from .singular_blocks import BlockFinding, examine_blocks
+from .sparse_newton import sparse_rows
 
 WORST = 5  # rows that do not hold, in a text
 SUSPICIOUS = (
     1 / HALF_OF_THE_DIGITS
 )  # the condition number from which on constraints are asked whether they are redundant
-CONDITION_LIMIT = 500  # unknowns up to which the condition of the initial equations is computed
 
 
 class Guess(NamedTuple):
@@ -246,9 +248,15 @@ class InitializationReport(Sections):
     def _condition(self) -> float | None:
         """The condition number of the initial equations, rows and columns scaled."""
         jacobian = self._found.jacobian
-        if jacobian is None or not self.consistent or not 0 < max(jacobian.shape) <= CONDITION_LIMIT:
+        if jacobian is None or not self.consistent or not jacobian.size:
             return None
         matrix = np.asarray(jacobian, float)
+        if matrix.ndim == 1:
+            sparse = sparse_rows(self._plan, self._rows)
+            assert sparse is not None
+            places = sparse.square.rows, sparse.square.cols
+            square = sp.csr_array((matrix[sparse.inside], places), shape=sparse.square.shape)
+            return sparse_rank_of(square, abs(square) * 0.0).condition
         for axis in (1, 0, 1):
             matrix = matrix / np.maximum(np.abs(matrix).max(axis=axis, keepdims=True), TINY)
         s = np.linalg.svd(matrix, compute_uv=False)
@@ -276,6 +284,11 @@ class InitializationReport(Sections):
             out.append(
                 f"the initial equations are ill-conditioned, {self._condition:.1e}: gradients with respect to the "
                 "starts lose digits"
+            )
+        if self._rows.unshared:
+            out.append(
+                f"there are more guesses than they can choose, and too many unknowns for the point nearest to all: "
+                f"{listed(self._rows.unshared, SHOWN)} gave way to those before"
             )
         return out
 

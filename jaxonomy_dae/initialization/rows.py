@@ -23,6 +23,7 @@ from ..errors import InitializationError
 from ..judgement.rank import above_errors
 from ..judgement.scaling import balanced, equilibrated
 from ..judgement.sparse_rank import sparse_rank_of
+from ..linear.choice import DENSE_UPTO
 from ..lowering.plan import SystemPlan
 from ..lowering.remembered import remembered
 from ..model.declared import declared_scale
@@ -32,6 +33,7 @@ from ..model.opaque import Networks
 from ..model.quantities import ABSENT
 from ..model.starts import Start
 from ..model.tables import ZERO, complete
+from ..structure.dulmage_mendelsohn import left_open
 from ..structure.matching import match_in_order
 from ..tolerances import HALF_OF_THE_DIGITS, ILL_CONDITIONED, KNOWN, NO_PART, TINY
 from .integrated import integrated
@@ -64,6 +66,9 @@ class InitialRows:
     redundant: tuple[int, ...]  # rows that must hold, though they follow from others
     settled: tuple[int, ...]  # of these, rows that follow from equations alone: no unknown moves them
     dropped: tuple[str, ...]  # fixed starts that values given by the caller outrank
+    unshared: tuple[
+        str, ...
+    ] = ()  # guesses that gave way to others, where there are too many unknowns for a compromise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -350,7 +355,15 @@ def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, r
     gradients = generic.rows(bare)
     pointer = np.concatenate([generic.jacobian.indptr, generic.jacobian.nnz + gradients.indptr[1:]])
     columns = np.concatenate([generic.jacobian.indices, gradients.indices]).astype(np.int64)
-    matched = match_in_order(pointer, columns, generic.jacobian.shape[1], n_equations)[n_equations:] >= 0
+    column = match_in_order(pointer, columns, generic.jacobian.shape[1], n_equations)
+    matched = column[n_equations:] >= 0
+    shares = _sharing(pointer, columns, column, n_equations + hard, ranks, generic.jacobian.shape[1])
+    unshared: tuple[str, ...] = ()
+    if plan.n_state > DENSE_UPTO:
+        unshared = tuple(
+            row.name for row, share, m in zip(rows[hard:], shares, matched[hard:], strict=True) if share > m
+        )
+        shares[:] = False
     missing = generic.jacobian.shape[1] - n_equations - int(matched.sum())
     settled = np.zeros(0, np.int64)
     if not missing:
@@ -362,7 +375,8 @@ def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, r
     kept = [row for row, gone in zip(rows[:hard], is_dropped, strict=True) if not gone]
     independent = [bool(m) for m, gone in zip(matched[:hard], is_dropped, strict=True) if not gone]
     redundant = tuple(k for k, alone in enumerate(independent) if not alone)
-    soft = [(row, True) for row, m in zip(rows[hard:], matched[hard:], strict=True) if m]
+    guesses = zip(rows[hard:], matched[hard:].tolist(), shares.tolist(), strict=True)
+    soft = [(row, m) for row, m, shared in guesses if m or shared]
     if generic.solve_for and (missing or any(rows[k].given >= 0 for k in redundant)):
         unknown = quoted([plan.flat.parameters.names[p] for p in generic.solve_for])
         what = "too few" if missing else "too many"
@@ -370,7 +384,22 @@ def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, r
     dropped = [row.name for row, gone in zip(rows[:hard], is_dropped, strict=True) if gone]
     alone = {rows[k].name for k in settled.tolist() if k < hard}
     follows = tuple(k for k, row in enumerate(kept) if row.name in alone)
-    return _chosen(guess, kept, independent, soft, redundant, follows, dropped)
+    chosen = _chosen(guess, kept, independent, soft, redundant, follows, dropped)
+    return dataclasses.replace(chosen, unshared=unshared)
+
+
+def _sharing(
+    pointer: np.ndarray, columns: np.ndarray, matched: np.ndarray, first: int, ranks: Sequence[_Rank], n: int
+) -> np.ndarray:
+    """True for guesses that share what rows before their rank leave open, shape (guesses,); `matched` is the column of
+    every row, `first` the number of the first guess."""
+    shares, row = [np.zeros(0, bool)], np.repeat(np.arange(len(matched)), np.diff(pointer))
+    for rank in ranks:
+        last, inside = first + len(rank.rows), slice(None, pointer[first])
+        is_open = left_open(row[inside], columns[inside], matched[:first], n)
+        shares.append(is_open[[r.quantity for r in rank.rows]] if rank.shares else np.zeros(len(rank.rows), bool))
+        first = last
+    return np.concatenate(shares)
 
 
 def _exchanged(generic: _Generic, gradients: Any, chosen: np.ndarray, hard: int) -> tuple[np.ndarray, np.ndarray]:

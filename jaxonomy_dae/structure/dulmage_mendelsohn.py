@@ -25,9 +25,7 @@ def dulmage_mendelsohn(pattern: Incidence, matched: np.ndarray):
     # From an equation too many, along its variables to the equations that hold them.
     held = owner[columns] >= 0
     too_many = _reach(rows[held], owner[columns[held]], np.flatnonzero(matched < 0), n)
-    # From a variable too many, along its equations to the variables these hold.
-    holds = matched[rows] >= 0
-    unsettled = _reach(columns[holds], matched[rows[holds]], np.flatnonzero(owner < 0), m)
+    unsettled = left_open(rows, columns, matched, m)
     in_over = too_many[rows]
     over_columns = np.zeros(m, bool)
     over_columns[columns[in_over]] = True
@@ -37,6 +35,15 @@ def dulmage_mendelsohn(pattern: Incidence, matched: np.ndarray):
     over = _components(rows[in_over], columns[in_over], too_many, over_columns)
     under = _components(rows[in_under], columns[in_under], under_rows, unsettled)
     return over, under
+
+
+def left_open(rows: np.ndarray, columns: np.ndarray, matched: np.ndarray, m: int) -> np.ndarray:
+    """True for the columns that equations do not determine, shape (m,), given the places of entries, and the column of
+    every equation in some maximum matching, −1 for none."""
+    # From a variable too many, along its equations to the variables these hold.
+    holds, too_many = matched[rows] >= 0, np.ones(m, bool)
+    too_many[matched[matched >= 0]] = False
+    return _reach(columns[holds], matched[rows[holds]], np.flatnonzero(too_many), m)
 
 
 def _reach(tail: np.ndarray, head: np.ndarray, start: np.ndarray, n: int) -> np.ndarray:
