@@ -8,7 +8,7 @@ circuit; D. Bernardi, E. Pawlikowski and J. Newman (1985), J. Electrochem. Soc. 
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import sympy
@@ -25,6 +25,8 @@ from .thermal import HeatCapacitor, ThermalConductor
 GAS_CONSTANT = 8.31446261815324  # J/(mol·K), CODATA 2018
 HOUR = 3600  # s
 EFFICIENCY = Interval(0.0, 1.0, open_low=True)
+Row: TypeAlias = Sequence[Value] | np.ndarray
+Each: TypeAlias = Any  # a `Value` for all cells, or an array with one for each
 
 
 class _Circuit(NamedTuple):
@@ -41,13 +43,17 @@ class _Circuit(NamedTuple):
 
 
 class _CellData(NamedTuple):
-    """What describes the circuit of a cell in rows: the table of the open-circuit voltage and the RC pairs."""
+    """What describes a cell: the arguments of `Cell`. In a pack, numbers may be arrays with one for each cell."""
 
-    soc: Any
-    ocv: Any
-    R: Sequence[Value]
-    C: Sequence[Value]
-    initial_voltage: Sequence[Value] | None
+    soc: Row
+    ocv: Row
+    Q: Each
+    R0: Each
+    R: Sequence[Each]
+    C: Sequence[Each]
+    eta: Each
+    initial_soc: Each
+    initial_voltage: Sequence[Each] | None
     kind: str
 
     def checked(self, name: str) -> "_CellData":
@@ -64,25 +70,25 @@ class _CellData(NamedTuple):
                 f"R, {len(C)} in C and {voltages} in initial_voltage"
             )
         known_kind(self.kind, name)
-        return _CellData(points, ocv, R, C, starts, self.kind)
+        return self._replace(soc=points, ocv=ocv, R=R, C=C, initial_voltage=starts)
 
 
 class _Cell(TwoPin):
     """The parts that cells share."""
 
-    def _circuit(self, given: _CellData, Q: Value, eta: Value, initial_soc: Value) -> _Circuit:
-        points, ocv, R, C, starts, kind = given.checked(self.name)
-        starts = [0.0] * len(R) if starts is None else starts
-        volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
-        charge = HOUR * self.parameter("Q", Q, unit="A*h", bounds=POSITIVE)
-        efficiency = self.parameter("eta", eta, unit="1", bounds=EFFICIENCY)
-        start = self.parameter("initial_soc", initial_soc, unit="1")
+    def _circuit(self, given: _CellData) -> _Circuit:
+        given = given.checked(self.name)
+        starts = [0.0] * len(given.R) if given.initial_voltage is None else given.initial_voltage
+        volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(given.ocv, start=1)]
+        charge = HOUR * self.parameter("Q", given.Q, unit="A*h", bounds=POSITIVE)
+        efficiency = self.parameter("eta", given.eta, unit="1", bounds=EFFICIENCY)
+        start = self.parameter("initial_soc", given.initial_soc, unit="1")
         z = self.variable("soc", start=start, fixed=True, unit="1")
         voltage, current = self._two_pins()
         reacting = current - (1 - efficiency) * smooth(Max(current, 0))
         self.add_equations(Eq(charge * der(z), reacting))
         overpotentials, heat = sympy.Integer(0), sympy.Integer(0)
-        for k, (resistance, capacity, start) in enumerate(zip(R, C, starts, strict=True), start=1):
+        for k, (resistance, capacity, start) in enumerate(zip(given.R, given.C, starts, strict=True), start=1):
             r = self.parameter(f"R{k}", resistance, unit="Ohm", bounds=POSITIVE)
             c = self.parameter(f"C{k}", capacity, unit="F", bounds=POSITIVE)
             v0 = self.parameter(f"initial_voltage{k}", start, unit="V")
@@ -91,17 +97,8 @@ class _Cell(TwoPin):
             self.declare_energy(c * v**2 / 2)
             overpotentials += v
             heat += v**2 / r
-        table, integral = interpolated(z, points, volts, kind)
-        return _Circuit(
-            voltage=voltage,
-            current=current,
-            soc=z,
-            reacting=reacting,
-            table=table,
-            table_energy=charge * integral,
-            overpotentials=overpotentials,
-            heat=heat,
-        )
+        table, integral = interpolated(z, np.asarray(given.soc), volts, given.kind)
+        return _Circuit(voltage, current, z, reacting, table, charge * integral, overpotentials, heat)
 
 
 class Cell(_Cell):
@@ -136,8 +133,8 @@ class Cell(_Cell):
         self,
         ev: EqnEnv,
         name: str,
-        soc: Sequence[Value] | np.ndarray,
-        ocv: Sequence[Value] | np.ndarray,
+        soc: Row,
+        ocv: Row,
         Q: Value = 1.0,
         R0: Value = 0.01,
         R: Sequence[Value] = (),
@@ -149,7 +146,7 @@ class Cell(_Cell):
     ):
         super().__init__(ev, name)
         resistance = self.parameter("R0", R0, unit="Ohm", bounds=POSITIVE)
-        c = self._circuit(_CellData(soc, ocv, R, C, initial_voltage, kind), Q, eta, initial_soc)
+        c = self._circuit(_CellData(soc, ocv, Q, R0, R, C, eta, initial_soc, initial_voltage, kind))
         voltage = self.output("ocv", c.table, unit="V")
         self.add_equations(Eq(c.voltage, voltage + resistance * c.current + c.overpotentials))
         self.declare_energy(c.table_energy)
@@ -184,8 +181,8 @@ class HeatedCell(_Cell):
         self,
         ev: EqnEnv,
         name: str,
-        soc: Sequence[Value] | np.ndarray,
-        ocv: Sequence[Value] | np.ndarray,
+        soc: Row,
+        ocv: Row,
         Q: Value = 1.0,
         R0: Value = 0.01,
         R: Sequence[Value] = (),
@@ -204,7 +201,7 @@ class HeatedCell(_Cell):
         entropy = self.parameter("dUdT", dUdT, unit="V/K")
         reference = self.parameter("T_ref", T_ref, unit="K", bounds=POSITIVE)
         heat = self.port("heat", Thermal)
-        c = self._circuit(_CellData(soc, ocv, R, C, initial_voltage, kind), Q, eta, initial_soc)
+        c = self._circuit(_CellData(soc, ocv, Q, R0, R, C, eta, initial_soc, initial_voltage, kind))
         voltage = self.output("ocv", c.table + entropy * (heat.T - reference), unit="V")
         gas = self.parameter("gas_constant", GAS_CONSTANT, unit="J/(mol*K)", bounds=POSITIVE)
         r = self.output("r", resistance * exp(activation / gas * (1 / heat.T - 1 / reference)), unit="Ohm")
@@ -238,7 +235,7 @@ def _shape(name: str, series: int, parallel: int) -> tuple[int, int]:
 class _Pack(Component):
     """Rows of cells in parallel, one after the other in series, from `p` to `n`."""
 
-    def _each(self, what: str, value: Any, shape: tuple[int, int], unit: str, bounds: Interval) -> Value | np.ndarray:
+    def _each(self, what: str, value: Each, shape: tuple[int, int], unit: str, bounds: Interval) -> Each:
         """Declares one quantity of the cells: a parameter of the pack where one value holds for all cells, else one
         value per cell."""
         if not np.ndim(value):
@@ -250,27 +247,25 @@ class _Pack(Component):
             )
         return np.asarray(value)
 
-    def _values(self, shape: tuple[int, int], values: dict[str, Any]) -> dict[str, object]:
+    def _values(self, shape: tuple[int, int], values: dict[str, Each]) -> dict[str, Each]:
         return {what: self._each(what, value, shape, *_OF_CELLS[what]) for what, value in values.items()}
 
     def _cells(
-        self, kind: type[Component], shape: tuple[int, int], given: _CellData, values: dict[str, Any]
+        self, kind: type[Component], shape: tuple[int, int], given: _CellData, more: dict[str, Each]
     ) -> ComponentArray:
         """Adds the cells and connects them; returns them, an array of the given shape."""
-        points, ocv, R, C, initial_voltage, table = given.checked(self.name)
+        given = given.checked(self.name)
         p, n = self.port("p", Electrical), self.port("n", Electrical)
-        volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
-
-        def of_pairs(
-            what: str, given: Sequence[Value | np.ndarray], unit: str, bounds: Interval
-        ) -> list[Value | np.ndarray]:
-            return [self._each(f"{what}{k}", value, shape, unit, bounds) for k, value in enumerate(given, start=1)]
-
-        options = {"R": of_pairs("R", R, "Ohm", POSITIVE), "C": of_pairs("C", C, "F", POSITIVE)}
-        if initial_voltage is not None:
-            options["initial_voltage"] = of_pairs("initial_voltage", initial_voltage, "V", Interval())
-        options |= self._values(shape, values)
-        cells = self.add_array("cell", kind, shape, points.tolist(), volts, kind=table, **options)
+        volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(given.ocv, start=1)]
+        options: dict[str, object] = {}
+        for what, unit, bounds in (("R", "Ohm", POSITIVE), ("C", "F", POSITIVE), ("initial_voltage", "V", Interval())):
+            row = getattr(given, what)
+            if row is not None:
+                options[what] = [self._each(f"{what}{k}", v, shape, unit, bounds) for k, v in enumerate(row, start=1)]
+        own = {what: getattr(given, what) for what in ("Q", "R0", "eta", "initial_soc")}
+        options |= self._values(shape, own | more)
+        points = np.asarray(given.soc).tolist()
+        cells = self.add_array("cell", kind, shape, points, volts, kind=given.kind, **options)
         self.connect(p, cells[0].p)
         self.connect(cells[:-1].n, cells[1:].p)
         self.connect(cells[:, :-1].n, cells[:, 1:].n)
@@ -301,20 +296,20 @@ class Pack(_Pack):
         name: str,
         series: int,
         parallel: int,
-        soc: Any,
-        ocv: Any,
-        Q: Value | np.ndarray = 1.0,
-        R0: Value | np.ndarray = 0.01,
-        R: Sequence[Any] = (),
-        C: Sequence[Any] = (),
-        eta: Value | np.ndarray = 1.0,
-        initial_soc: Value | np.ndarray = 1.0,
-        initial_voltage: Sequence[Any] | None = None,
+        soc: Row,
+        ocv: Row,
+        Q: Each = 1.0,
+        R0: Each = 0.01,
+        R: Sequence[Each] = (),
+        C: Sequence[Each] = (),
+        eta: Each = 1.0,
+        initial_soc: Each = 1.0,
+        initial_voltage: Sequence[Each] | None = None,
         kind: str = "linear",
     ):
         super().__init__(ev, name)
-        values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc}
-        self._cells(Cell, _shape(name, series, parallel), _CellData(soc, ocv, R, C, initial_voltage, kind), values)
+        data = _CellData(soc, ocv, Q, R0, R, C, eta, initial_soc, initial_voltage, kind)
+        self._cells(Cell, _shape(name, series, parallel), data, {})
 
 
 class HeatedPack(_Pack):
@@ -344,28 +339,28 @@ class HeatedPack(_Pack):
         name: str,
         series: int,
         parallel: int,
-        soc: Any,
-        ocv: Any,
-        Q: Value | np.ndarray = 1.0,
-        R0: Value | np.ndarray = 0.01,
-        R: Sequence[Any] = (),
-        C: Sequence[Any] = (),
-        eta: Value | np.ndarray = 1.0,
-        initial_soc: Value | np.ndarray = 1.0,
-        initial_voltage: Sequence[Any] | None = None,
+        soc: Row,
+        ocv: Row,
+        Q: Each = 1.0,
+        R0: Each = 0.01,
+        R: Sequence[Each] = (),
+        C: Sequence[Each] = (),
+        eta: Each = 1.0,
+        initial_soc: Each = 1.0,
+        initial_voltage: Sequence[Each] | None = None,
         kind: str = "linear",
-        Ea: Value | np.ndarray = 0.0,
-        dUdT: Value | np.ndarray = 0.0,
-        T_ref: Value | np.ndarray = 298.15,
-        C_heat: Value | np.ndarray = 50.0,
+        Ea: Each = 0.0,
+        dUdT: Each = 0.0,
+        T_ref: Each = 298.15,
+        C_heat: Each = 50.0,
         G_neighbour: Value = 0.5,
-        G_coolant: Value | np.ndarray = 0.1,
-        initial_temperature: Value | np.ndarray = 298.15,
+        G_coolant: Each = 0.1,
+        initial_temperature: Each = 298.15,
     ):
         super().__init__(ev, name)
         shape = _shape(name, series, parallel)
-        values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc, "Ea": Ea, "dUdT": dUdT, "T_ref": T_ref}
-        cells = self._cells(HeatedCell, shape, _CellData(soc, ocv, R, C, initial_voltage, kind), values)
+        data = _CellData(soc, ocv, Q, R0, R, C, eta, initial_soc, initial_voltage, kind)
+        cells = self._cells(HeatedCell, shape, data, {"Ea": Ea, "dUdT": dUdT, "T_ref": T_ref})
         thermal = {"C_heat": C_heat, "G_coolant": G_coolant, "initial_temperature": initial_temperature}
         each = self._values(shape, thermal)
         between = self.parameter("G_neighbour", G_neighbour, unit="W/K", bounds=NONNEGATIVE)

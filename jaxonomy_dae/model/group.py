@@ -67,7 +67,7 @@ class Group(Columns):
         quantities, parameters = (np.arange(ids.size).reshape(ids.shape) for ids in (self.factor, self.parameter))
         return dataclasses.replace(self.reading(quantities), parameter=parameters)
 
-    def numbers(self, parameters: Any) -> tuple[list[Any], list[np.ndarray]]:
+    def numbers(self, parameters: Numeric) -> tuple[list[Numeric], list[np.ndarray]]:
         """The parameters and the coefficients of the template, each (*batch, n), given all parameters."""
         return [parameters[..., column] for column in self.parameter.T], list(self.coefficient.T)
 

@@ -2,11 +2,12 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, overload
+from typing import overload
 
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Numeric, Time
 from .group import Group
 from .symbolic import SymbolicTemplate
 
@@ -30,13 +31,13 @@ class Formulas(Group):
     target: np.ndarray  # (n,): what the numbers are of
 
     @classmethod
-    def of(cls, template: SymbolicTemplate, target: Any, parameter: Any) -> "Formulas":
+    def of(cls, template: SymbolicTemplate, target: Numeric, parameter: Numeric) -> "Formulas":
         """Formulas by rows."""
         n = len(target)
         read = np.array(parameter, np.int64).reshape(n, template.n_parameters)
         return cls(template, np.zeros((n, 0)), read, np.zeros((n, 0)), np.array(target, np.int64))
 
-    def put(self, array: Any, parameters: Any, t: Any = 0.0) -> Any:
+    def put(self, array: Numeric, parameters: Numeric, t: Time = 0.0) -> Numeric:
         """The array with the numbers at their targets, in its last axis; in NumPy it is changed. Numbers that are not
         finite are named by those who call."""
         given = self.numbers(parameters)

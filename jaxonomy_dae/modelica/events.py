@@ -9,14 +9,14 @@ the continuous variables of their loop solved for in between: the event iteratio
 import collections
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import sympy
 from sympy.core.relational import Relational
 
 from ..aliases import Condition
 from ..errors import ModelError
-from ..modeling.events import EventFlag, Sampled, assign, pre, reinit, terminate
+from ..modeling.events import Action, Assign, EventFlag, Sampled, assign, pre, reinit, terminate
 from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 from . import tree
 from .before_only import BeforeOnly
@@ -124,7 +124,11 @@ def _with_whens(scope: Scope, value: Value, within: tuple[tree.Branches, ...] = 
             ends = scope.kept.in_events(both(negated(condition), plain(sympy.Ne(done, 0))))
             scope.component._event(ends, (assign(done, 0),), None, EventFlag.AT_START | EventFlag.REVOCABLE)
         due = both(_with_whens(scope, condition, (*within, s)), plain(sympy.Eq(done, 0)))
-        new = {a.target: a.value.xreplace(_present(a.value)) for a in _actions(scope, s.branches[0][1], True)}
+        new: dict[sympy.Basic, sympy.Basic] = {
+            a.target: a.value.xreplace(_present(a.value))
+            for a in _actions(scope, s.branches[0][1], True)
+            if isinstance(a, Assign)
+        }
         found.append((due, new))
     return _replaced(value, found) if found else value
 
@@ -175,7 +179,9 @@ def write_end_of_start(scope: Scope) -> None:
     scope.component._event(condition, (assign(scope.initial, 0),), None, EventFlag.AT_START | EventFlag.REVOCABLE)
 
 
-Rise = tuple[Any, Value]  # the truth of a condition when branches were chosen last, a discrete variable; the condition
+Rise = tuple[
+    DiscreteSymbol, Value
+]  # the truth of a condition when branches were chosen last, a discrete variable; the condition
 
 
 def write_when(scope: Scope, s: tree.Branches) -> None:
@@ -224,7 +230,7 @@ def _write_chain(scope: Scope, chain: list[tuple[list[Rise], tuple[tree.Statemen
     3.6, 8.3.5). Two events in turn, as for modes that change at once."""
     kept, ends = scope.kept.in_events, EventFlag.AT_START | EventFlag.REVOCABLE
     risen: Value = False
-    cases: dict[Any, list[tuple[Value, Value]]] = {}
+    cases: dict[sympy.Symbol, list[tuple[Value, Value]]] = {}
     for rises, body in chain:
         here = both(_risen(rises), negated(risen))
         risen = either(risen, here)
@@ -250,24 +256,24 @@ def _before_tick(scope: Scope, parts: list[tree.Expression]) -> list[Value]:
         return [v for v in (scope.evaluate(_inner(p)) for p in parts) if not isinstance(v, Sampled)]
 
 
-def _pairs(scope: Scope, body: tuple[tree.Statement, ...]) -> list[tuple[Any, Value]]:
+def _pairs(scope: Scope, body: tuple[tree.Statement, ...]) -> list[tuple[Target, Value]]:
     """Pairs (variable, new value) of all actions, as `_each_action` finds them, with the values before the event."""
     with scope.at_event():
         return list(_each_action(scope, body))
 
 
-def _actions(scope: Scope, body: tuple[tree.Statement, ...], only_if: Value) -> list[Any]:
+def _actions(scope: Scope, body: tuple[tree.Statement, ...], only_if: Value) -> list[Action]:
     return [
         terminate(target) if isinstance(target, str) else _action(target, _first(target, [(only_if, value)]))
         for target, value in _pairs(scope, body)
     ]
 
 
-def _action(target: Any, value: Value) -> Any:
+def _action(target: sympy.Symbol, value: Value) -> Action:
     return assign(target, value) if isinstance(target, DiscreteSymbol) else reinit(target, value)
 
 
-def _first(target: Any, cases: list[tuple[Value, Value]]) -> Value:
+def _first(target: sympy.Symbol, cases: list[tuple[Value, Value]]) -> Value:
     """The value of the first case whose condition holds; the one before the event if none does."""
     discrete = isinstance(target, DiscreteSymbol)
     value: Value = pre(target) if discrete else target

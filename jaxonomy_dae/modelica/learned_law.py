@@ -10,8 +10,9 @@ import sympy
 from ..errors import ModelError
 from ..modeling.component import Component
 from ..modeling.symbols import VariableSymbol
+from .values import Value
 
-Law: TypeAlias = Callable[[Any, Any], Any]  # (component, written value) to the value in its place
+Law: TypeAlias = Callable[[Component, Value], Value]  # (component, written value) to the value in its place
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,12 +28,12 @@ class LearnedLaw:
     inputs: Sequence[str]
     beside: bool
 
-    def __call__(self, m: Component, written: Any) -> Any:
+    def __call__(self, m: Component, written: Value) -> Value:
         (value,) = m.learned(f"{self.name}.law", self.network, [m.symbol(i) for i in self.inputs] or _read(m, written))
         return written + value if self.beside else value
 
 
-def _read(m: Component, written: Any) -> list[Any]:
+def _read(m: Component, written: Value) -> list[VariableSymbol]:
     """The variables that an expression reads, in the order of their declaration."""
     symbols = written.free_symbols if isinstance(written, sympy.Basic) else set()
     order = list(m.variables)

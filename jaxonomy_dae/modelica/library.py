@@ -5,11 +5,11 @@ import functools
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from ..errors import ModelError
 from .read_base import read_base
-from .tree import Class, Declaration
+from .tree import Class, Declaration, Modifiers
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Found:
     source: Class
     path: str
     scopes: tuple["Found", ...]
-    changes: tuple[tuple[dict[str, Any], tuple["Found", ...]], ...] = ()
+    changes: tuple[tuple[Modifiers, tuple["Found", ...]], ...] = ()
 
     @property
     def inside(self) -> tuple["Found", ...]:

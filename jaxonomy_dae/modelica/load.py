@@ -15,6 +15,7 @@ from .library import Library
 from .read_base import read_base, read_modifiers
 from .read_rumoca import read_rumoca
 from .roots import ROOT
+from .tree import Modifiers
 
 _PLACE = re.compile(r"× (?P<what>[^\n]*)\s+╭─\[[^\]]*?:(?P<line>\d+):(?P<column>\d+)\]")
 _UNRESOLVED = re.compile(r"unresolved (type reference|function call|component reference|[\w ]+): '([^']+)'")
@@ -93,7 +94,7 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _annotation(text: str, name: str) -> dict[str, Any]:
+def _annotation(text: str, name: str) -> Modifiers:
     """The annotation of a class, as far as it is about the experiment."""
     body = re.search(rf"\b(?:model|class|block)\s+{re.escape(name)}\b(.*?)\bend\s+{re.escape(name)}\s*;", text, re.S)
     found = re.search(r"\bexperiment\s*(\([^()]*\))", body[1]) if body else None

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import sympy
 
+from ..aliases import Numeric
 from ..errors import ModelError
 from ..modeling.component import Component
-from ..modeling.symbols import DiscreteSymbol, PreviousSymbol
+from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 from .values import Results, Value
 
 Word = Any  # an int below 2^64, or an array of the type uint64
@@ -84,12 +85,12 @@ def _signed(value: int, bits: int) -> int:
     return value - (1 << bits) if value >> (bits - 1) else value
 
 
-def numbers(name: str) -> Callable[..., Any]:
+def numbers(name: str) -> Callable[..., Numeric]:
     """A function in JAX from the entries of a state, as floating-point numbers, to the random number and the entries of
     the next state."""
     step, count = GENERATORS[name]
 
-    def function(*state: Any) -> Any:
+    def function(*state: Numeric) -> Numeric:
         whole = [jnp.asarray(s).astype(jnp.int64) for s in state]
         unsigned = [w.astype(jnp.uint32).astype(jnp.uint64) for w in whole]
         words = [low | high << 32 for low, high in zip(unsigned[0:32:2], unsigned[1:32:2], strict=True)]
@@ -141,7 +142,7 @@ class RandomNumbers:
         r, *after = self.known[key]
         return Results([r, after])
 
-    def _as_variable(self, entry: Value) -> Any:
+    def _as_variable(self, entry: Value) -> VariableSymbol:
         if not isinstance(entry, int | float | DiscreteSymbol | PreviousSymbol):
             raise ModelError(f"the state of a random generator is kept in variables that a when assigns; got {entry}")
         present = DiscreteSymbol(entry.path) if isinstance(entry, PreviousSymbol) else sympy.sympify(entry)

@@ -6,7 +6,7 @@ Annotations are passed over, but for that of a model, which says how to run it.
 
 import re
 from collections.abc import Iterator
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from ..errors import ModelError
 from . import tree
@@ -48,7 +48,7 @@ def read_base(text: str) -> tree.Class:
     return Reader(text).file()
 
 
-def read_modifiers(text: str) -> dict[str, Any]:
+def read_modifiers(text: str) -> tree.Modifiers:
     """What stands in parentheses behind a name, such as `(StopTime = 2.0)`."""
     return Reader(text).modifiers()
 
@@ -379,10 +379,10 @@ class Reader:
 
     # --- declarations and classes ------------------------------------------------------------------------------------
 
-    def modifiers(self) -> dict[str, Any]:
+    def modifiers(self) -> tree.Modifiers:
         """What stands in parentheses behind a name, if anything does; a redeclared class is noted as the declaration of
         what it stands for."""
-        out: dict[str, Any] = {}
+        out: tree.Modifiers = {}
         ended = not self.take("(")
         while not (ended or self.take(")")):
             self.past(BEFORE_MODIFIER)
@@ -479,12 +479,12 @@ class Reader:
         comment = self.comment()
         declarations: list[tree.Declaration] = []
         classes: dict[str, tree.Class] = {}
-        bases: list[tuple[str, dict[str, Any]]] = []
+        bases: list[tuple[str, tree.Modifiers]] = []
         imports: list[tuple[str, str]] = []
         sections: dict[str, list] = {
             "equation": [], "initial equation": [], "algorithm": [], "initial algorithm": []
         }  # fmt: skip
-        annotation: dict[str, Any] = {}
+        annotation: tree.Modifiers = {}
         external = None
         while not self.take("end"):
             if self.take("protected", "public"):

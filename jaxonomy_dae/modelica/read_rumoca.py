@@ -73,7 +73,7 @@ class _Reader:
         constant = role in ("parameter", "constant")
         for k, place in enumerate(itertools.product(*(range(1, n + 1) for n in of["dimensions"]))):
             fixed = at.get("fixed")
-            modifiers: dict[str, Any] = {
+            modifiers: tree.Modifiers = {
                 "stateSelect": tree.Reference(("StateSelect", _PREFERENCE[at["state_select"]]), ((), ()))
             }
             if at.get("unit") is not None:

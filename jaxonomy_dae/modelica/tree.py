@@ -177,17 +177,18 @@ class Jump(NamedTuple):
 
 
 Statement: TypeAlias = Equality | Assignment | Effect | Branches | Loop | Jump
+Modifiers: TypeAlias = dict[str, Any]  # by name: an expression, modifiers, or the declaration of a redeclared class
 
 
 class Declaration(NamedTuple):
     """A declared component: `prefixes` such as parameter or output, `type` and `name` as written, its `dimensions`, its
-    modifiers (name to expression, or to a dictionary of such), and its binding `value`."""
+    modifiers, and its binding `value`."""
 
     prefixes: frozenset[str]
     type: str
     name: str
     dimensions: tuple[Expression, ...]
-    modifiers: dict[str, Any]
+    modifiers: Modifiers
     value: Expression | None
     comment: str
     line: int
@@ -213,9 +214,9 @@ class Class(NamedTuple):
     algorithms: tuple[tuple[Statement, ...], ...] = ()
     initial_algorithms: tuple[tuple[Statement, ...], ...] = ()
     classes: dict[str, "Class"] = {}
-    bases: tuple[tuple[str, dict[str, Any]], ...] = ()
+    bases: tuple[tuple[str, Modifiers], ...] = ()
     imports: tuple[tuple[str, str], ...] = ()
-    annotation: dict[str, Any] = {}
+    annotation: Modifiers = {}
     literals: tuple[str, ...] = ()
     alias: Declaration | None = None
     external: str | None = None

@@ -103,7 +103,7 @@ class RelationDeclarations(EventDeclarations):
         known, condition = RelationSymbol(relation.number), relation.condition
         for holds, value in ((condition, 1), (sympy.Not(condition), 0)):
             action = Assign(known, sympy.Integer(value))
-            self._relation_event(holds, shortened(condition), relation.watched, action, kink=relation.kink)
+            self._relation_event(holds, shortened(condition), action, watched=relation.watched, kink=relation.kink)
 
     def _ticks(self, relation: Timed) -> None:
         """Clocks of a relation of time. At the initial time it is as its sides say, unless a clock ticks there."""
@@ -112,7 +112,7 @@ class RelationDeclarations(EventDeclarations):
         as_it_is = sympy.Piecewise((1, condition), (0, True))
         for clock, after in edges.clocks:
             value = _unless(sympy.Or(unknown, sympy.Not(edges.turns)), as_it_is, after)
-            self._relation_clock(clock, shortened(condition), Assign(known, value), kink=relation.kink)
+            self._relation_event(clock, shortened(condition), Assign(known, value), kink=relation.kink)
 
     def _ticks_of_steps(self, whole: TimedSteps) -> None:
         """Clocks of a whole part of time, which is halfway to the next number from the one that it has at a tick."""
@@ -122,10 +122,7 @@ class RelationDeclarations(EventDeclarations):
         for clock, rises in whole.edges.clocks:
             after = sympy.floor(whole.argument + rises - sympy.Rational(1, 2))
             value = _unless(sympy.Or(unknown, sympy.Not(whole.edges.turns)), now, after)
-            self._relation_clock(clock, shortened(now), Assign(live, sympy.Integer(0)), Assign(known, value))
-
-    def _relation_clock(self, clock: Sampled, text: str, *actions: Assign, kink: bool = False) -> None:
-        self._event(clock, actions, None, EventFlag.RELATION | (EventFlag.KINK if kink else NO_FLAG), text)
+            self._relation_event(clock, shortened(now), Assign(live, sympy.Integer(0)), Assign(known, value))
 
     def _steps(self, whole: Stepping) -> None:
         """Events of a whole part. One may leave more than one number behind at an instant, where the argument jumps."""
@@ -134,17 +131,19 @@ class RelationDeclarations(EventDeclarations):
         unknown: Condition = sympy.Eq(live, LIVE)
         found: Condition = sympy.Ne(live, LIVE)
         text, watched = shortened(now), whole.watched
-        self._relation_event(unknown, text, watched, Assign(live, sympy.Integer(0)), Assign(known, now))
+        self._relation_event(unknown, text, Assign(live, sympy.Integer(0)), Assign(known, now), watched=watched)
         for condition, value in (
             (sympy.Ge(whole.argument, known + 1, evaluate=False), sympy.Max(before + 1, now)),
             (sympy.Lt(whole.argument, known, evaluate=False), sympy.Min(before - 1, now)),
         ):
-            self._relation_event(condition, text, sympy.And(found, watched), Assign(known, value))
+            self._relation_event(condition, text, Assign(known, value), watched=sympy.And(found, watched))
 
     def _relation_event(
-        self, condition: Condition, text: str, watched: Condition, *actions: Assign, kink: bool = False
+        self, condition: Condition, text: str, *actions: Assign, watched: Condition = sympy.true, kink: bool = False
     ) -> None:
-        flags = EventFlag.AT_START | EventFlag.REVOCABLE | EventFlag.RELATION | (EventFlag.KINK if kink else NO_FLAG)
+        flags = EventFlag.RELATION | (EventFlag.KINK if kink else NO_FLAG)
+        if not isinstance(condition, Sampled):
+            flags |= EventFlag.AT_START | EventFlag.REVOCABLE
         self._event(condition, actions, None, flags, text, watched)
 
 

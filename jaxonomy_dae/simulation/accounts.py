@@ -5,7 +5,6 @@ speed of the end of a massless spring, is taken along the vector field.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +48,7 @@ def account_values(
     return _terms(*given) if is_staged(given) else _compiled(*given)
 
 
-def _terms(system: AcausalSystem, ts: Times, states: State, inputs: Args, discrete: Any) -> Any:
+def _terms(system: AcausalSystem, ts: Times, states: State, inputs: Args, discrete: Array | None) -> Numeric:
     def one(t, x, q):
         return _at_one_time(system if q is None else system.holding(q), t, x, inputs)
 

@@ -5,8 +5,6 @@ schedule with an unknown that is not finite, though all it reads is, has failed:
 the order in which it is eliminated divides by zero, or because Newton's method finds no root.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -25,7 +23,7 @@ from .preparation import term_of
 
 SHOWN = 4  # names, values and equations of each kind in an error
 NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
-Instant = tuple[Any, Any]  # (time, state)
+Instant = tuple[Time, State]  # (time, state)
 
 
 def failed_block(system: AcausalSystem, first: Instant, last: Instant, t1: Time, inputs: Inputs) -> str:

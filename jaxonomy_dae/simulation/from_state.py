@@ -23,17 +23,12 @@ def from_state(system: AcausalSystem, t0: Time, inputs: Args, x: Float[Array, " 
     the state and by parameters, which are those of the projection at the point found."""
     limit = jnp.sqrt(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + system.state_sizes)
     nothing = jnp.zeros((), jnp.int32)
+    zero = jnp.zeros_like(x)
+    given = InitialPoint(
+        x=x, solved=x[:0], residual=zero, limit=limit, target=zero, method=nothing, evaluations=nothing, jacobian=None
+    )
     if not system.is_constrained:
-        return InitialPoint(
-            x=x,
-            solved=x[:0],
-            residual=jnp.zeros_like(x),
-            limit=limit,
-            target=jnp.zeros_like(x),
-            method=nothing,
-            evaluations=nothing,
-            jacobian=None,
-        )
+        return given
     frozen = jax.lax.stop_gradient
     still, driving = (
         jax.tree.map(lambda leaf: frozen(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
@@ -42,16 +37,7 @@ def from_state(system: AcausalSystem, t0: Time, inputs: Args, x: Float[Array, " 
     near = still.project(frozen(t0), frozen(x), driving, iterations=ITERATIONS)
     # near has the value of the search and, by x − frozen(x), the derivative of x: the last step carries it over.
     moved = system.project(t0, near + (x - frozen(x)), inputs, iterations=1)
-    return InitialPoint(
-        x=moved,
-        solved=x[:0],
-        residual=frozen(moved - near),
-        limit=limit,
-        target=jnp.zeros_like(x),
-        method=nothing,
-        evaluations=nothing,
-        jacobian=None,
-    )
+    return given._replace(x=moved, residual=frozen(moved - near))
 
 
 def check_array(system: AcausalSystem, initial: Any) -> None:

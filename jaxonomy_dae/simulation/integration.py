@@ -15,7 +15,7 @@ from ..aliases import Args, Controller, Inputs, PyTree, Result, Solver, State, T
 from ..hybrid.control import ENDED, AtEvents
 from ..hybrid.problem import HybridState, HybridTerm
 from ..hybrid.solver import CLASH, WithEvents
-from ..hybrid.start import start
+from ..hybrid.start import Resumed, start
 from ..initialization.check import check
 from ..initialization.initialize import InitialPoint, initialize, is_consistent
 from ..initialization.ladder import Found
@@ -97,7 +97,7 @@ class _Start(NamedTuple):
 
     system: AcausalSystem
     found: InitialPoint
-    resumed: Any
+    resumed: Resumed | None
     admitted: Array
 
 

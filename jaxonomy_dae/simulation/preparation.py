@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -60,7 +59,7 @@ def term_of(system: AcausalSystem, implicit: bool, forwards: bool = False) -> di
 
 def prepared(
     system: AcausalSystem, solver: Solver, implicit: bool, watch: Watch | None, atol: Tolerance, judged: bool = True
-) -> Any:
+) -> Solver:
     """The solver with what the system supplies filled in: projections and the determinants to watch.
 
     How far a projection moves counts as an error of the step, so that steps which end where the constraints have no

@@ -3,6 +3,7 @@
 import json
 import pickle
 import re
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ def save_compiled(compiled: Any, path: str | PathLike[str]) -> None:
     Path(path).write_bytes(MARK + pickle.dumps((json.dumps(told), trees, content)))
 
 
-def load_compiled(path: str | PathLike[str]) -> Any:
+def load_compiled(path: str | PathLike[str]) -> Callable:
     """Loads a program that `save_compiled` wrote. Call it with arguments of the same shapes and types: nothing is
     compiled or traced. Loading runs code from the file, so load only files of people you trust.
 
@@ -78,11 +79,11 @@ def load_compiled(path: str | PathLike[str]) -> Any:
     return _loaded(content, arguments, results)
 
 
-def _loaded(content: bytes, arguments: PyTree, results: PyTree) -> Any:
+def _loaded(content: bytes, arguments: PyTree, results: PyTree) -> Callable:
     return private("deserialize_executable")(content, arguments, results, execution_devices=jax.devices()[:1])
 
 
-def _try(compiled: Any, loaded: Any) -> None:
+def _try(compiled: Any, loaded: Callable) -> None:
     """Runs a program once. Parts that its file lacks are missed whatever the values of its arguments."""
     arguments, keywords = jax.tree.map(lambda info: jnp.zeros(info.shape, info.dtype), compiled.args_info)
     try:

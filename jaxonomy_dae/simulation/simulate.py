@@ -200,22 +200,18 @@ def simulate(
         solver=solver,
         rtol=rtol,
         atol=atol,
-        dtmax=dtmax,
-        jump_ts=jump_ts,
-        control=tuple(control),
         ends=step_ends(system.plan, read),
         adjoint=adjoint,
         controller=stepsize_controller,
-        max_steps=max_steps,
         max_events=max_events,
         save_events=save_events,
         progress=progress,
         throw=throw,
         known=not is_traced((given, adjoint, stepsize_controller)),
         duration=None if is_traced((t0, t1)) else float(t1) - float(t0),
-        asked=Asked.of(
+        asked=Asked(
             jump_ts, dtmax, max_steps, None if prescribed else solver, tuple(control), tolerances, throw is not False
-        ),
+        ).comparable(),
     )
     return call.traced() if is_traced((given, call.options())) else call.outside()
 
@@ -251,13 +247,9 @@ class _Call:
     solver: Solver  # None: that of the choice
     rtol: Tolerance
     atol: Tolerance
-    dtmax: Time
-    jump_ts: Times
-    control: tuple[str, ...]
     ends: StepEnds
     adjoint: diffrax.AbstractAdjoint | None
     controller: Controller
-    max_steps: int
     max_events: int | None
     save_events: bool | None
     progress: bool
@@ -269,7 +261,7 @@ class _Call:
     @property
     def bounds(self) -> tuple[int, int]:
         """The largest numbers of steps and of events."""
-        return self.max_steps, MOST_EVENTS if self.max_events is None else self.max_events
+        return self.asked.max_steps, MOST_EVENTS if self.max_events is None else self.max_events
 
     @property
     def run_by(self) -> Solver:
@@ -291,14 +283,14 @@ class _Call:
         listed = room if self.max_events is None else self.max_events
         room = listed if events is not None and events.are_listed else 0
         few = room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS
-        steps, adjoint = self.controller, self.adjoint
+        steps, adjoint, asked = self.controller, self.adjoint, self.asked
         if steps is None:
-            steps = controller_for(system, solver, self.rtol, self.atol, self.dtmax, self.control)
+            steps = controller_for(system, solver, self.rtol, self.atol, asked.dtmax, asked.control)
         if adjoint is None:
             adjoint = default_adjoint(is_forwards(self.given), batch_size(self.given), self.known)
         return Options(
-            solver=solver, adjoint=adjoint, controller=clipped(steps, self.jump_ts, self.ends),
-            max_steps=self.max_steps + self.ends.count, progress=self.progress, max_events=self.bounds[1], room=room,
+            solver=solver, adjoint=adjoint, controller=clipped(steps, asked.jump_ts, self.ends),
+            max_steps=asked.max_steps + self.ends.count, progress=self.progress, max_events=self.bounds[1], room=room,
             save_events=few and self.known if self.save_events is None else self.save_events,
         )  # fmt: skip
 
@@ -312,7 +304,7 @@ class _Call:
         known = not is_traced((size, self.rtol))
         floor = on_device(np.divide(size, self.rtol) if known else jnp.divide(size, self.rtol), size.dtype)
         return (
-            Watch(self.given.t1, floor, int(SHARE * self.max_steps), of_run=True)
+            Watch(self.given.t1, floor, int(SHARE * self.asked.max_steps), of_run=True)
             if final
             else Watch(self.given.t1, floor)
         )
@@ -383,7 +375,7 @@ class _Call:
             return bool(outcome.is_stiff)
         there = self.system if outcome.held is None else self.system.holding(outcome.held)
         decay = decay_at(term_of(there, implicit=False), self.given.inputs, *outcome.last)
-        return is_stiff(decay, float(self.given.t1 - outcome.last[0]), self.max_steps)
+        return is_stiff(decay, float(self.given.t1 - outcome.last[0]), self.asked.max_steps)
 
     def _solution(
         self,

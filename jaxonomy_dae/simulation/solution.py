@@ -1,5 +1,6 @@
 """Solutions: every variable by name."""
 
+import dataclasses
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from html import escape
@@ -47,19 +48,11 @@ class Asked(eqx.Module):
     tolerances: tuple[Tolerance, Tolerance] | None = None  # rtol, and atol of each state
     throw: bool = eqx.field(static=True, default=True)
 
-    @staticmethod
-    def of(
-        jump_ts: Times,
-        dtmax: Time,
-        max_steps: int,
-        solver: Solver,
-        control: tuple[str, ...],
-        tolerances: Tolerance,
-        throw: bool,
-    ) -> "Asked":
-        """The options, with a solver only if solutions that name it can be compared."""
+    def comparable(self) -> "Asked":
+        """The options, without a solver if solutions that name it could not be compared."""
+        solver = self.solver
         known = not any(eqx.is_array(leaf) for leaf in jax.tree.leaves(solver)) and isinstance(solver, Hashable)
-        return Asked(jump_ts, dtmax, max_steps, solver if known else None, control, tolerances, throw)
+        return self if known else dataclasses.replace(self, solver=None)
 
     @property
     def options(self) -> dict[str, Any]:
@@ -158,17 +151,11 @@ class Solution(eqx.Module):
         column = self._state(int(quantity[0]), float(factor[0]))
         if column is not None:
             return column
-        given = (self.system, self.ts, self.states, self.inputs, self.discrete)
-        if is_staged(given):
-            return self._where_reached(_observed(*given, quantity, factor))[:, 0]
-        if not is_traced(given):
-            return picked(self._known_columns((name,), {}, quantity, factor, None), (slice(None), 0))
-        values, _ = self._evaluated(given[1], given[2], given[4], quantity, factor)
-        return self._where_reached(values)[:, 0]
+        return picked(self._columns((name,)), (slice(None), 0))
 
     def _evaluated(
         self, ts: Numeric, states: Numeric, discrete: Numeric, quantity: np.ndarray, factor: np.ndarray
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Numeric, Numeric]:
         """The values of quantities at times, shape (times, at least len(quantity)), and those of all quantities at
         `_some` times where they are looked at. Numbers of names, and names of one step of a large model, share a
         program."""
@@ -221,7 +208,7 @@ class Solution(eqx.Module):
         found = amplified(self.system, names, quantity, factor, np.asarray(values, float), at, tolerances, float(rtol))
         found = [one for one in found if one.name not in asked.control]
         if found:
-            warnings.warn(sentence(found), RuntimeWarning, stacklevel=4)
+            warnings.warn(sentence(found), RuntimeWarning, stacklevel=5)
 
     def _columns(self, names: tuple[str, ...]) -> Numeric:
         """The values of several variables, shape `(n, len(names))`, evaluated at once."""
@@ -255,7 +242,7 @@ class Solution(eqx.Module):
 
     def _known_columns(
         self, names: tuple[str, ...], own: dict[str, Numeric], quantity: np.ndarray, factor: np.ndarray, inside: Numeric
-    ) -> Any:
+    ) -> Numeric:
         """`_columns` outside of jit, grad and vmap: one program at most."""
         read = [name for name in names if name not in own]
         values = np.zeros((*self.ts.shape, len(read)), self.states.dtype)
@@ -399,7 +386,7 @@ class Solution(eqx.Module):
         return f"<table><caption>Solution</caption>{cells}</table>"
 
 
-def _each(batch: Solution, read: Callable[[Solution], Any]) -> Any:
+def _each(batch: Solution, read: Callable[[Solution], Numeric]) -> Numeric:
     """Reads every solution of a batch, by mapping over the batch axes."""
     return eqx.filter_vmap(read)(batch)
 

@@ -1,7 +1,6 @@
 """Step sizes for a compiled system: the controller, the first step, and where steps must end."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -38,7 +37,7 @@ def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Tolerance:
 
 def controller_for(
     system: AcausalSystem, solver: Solver, rtol: Tolerance, atol: Tolerance, dtmax: Time, control: Sequence[str] = ()
-) -> Any:
+) -> Controller:
     """The step-size controller for these tolerances, the absolute ones in units of the nominal values. If the user
     gives no longest step, it is bounded by the period of the waves that drive the model."""
     controller: Controller = step_control(solver, rtol, scaled_atol(system, atol), dtmax=dtmax)
@@ -67,7 +66,7 @@ def clipped(controller: Controller, jump_ts: Times, ends: StepEnds) -> Controlle
 
 def first_step(
     system: AcausalSystem, t0: Time, t1: Time, x0: State, inputs: Args, order: Numeric, controller: Controller
-) -> Any:
+) -> Time:
     """The size of the first step (Hairer, Nørsett & Wanner 1993, II.4), kept out of differentiation."""
     if isinstance(controller, diffrax.StepTo) or not x0.shape[0]:
         return None if isinstance(controller, diffrax.StepTo) else t1 - t0
