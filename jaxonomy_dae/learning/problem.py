@@ -225,7 +225,7 @@ class Problem:
         adam: int = 0,
         learning_rate: float = 0.02,
         horizons: Sequence[float] | None = None,
-        steps: int = 200,
+        steps: int = 500,
         warn: bool = True,
         progress: Any = None,
     ) -> Estimate:
