@@ -258,7 +258,7 @@ def _pattern(x: Array) -> Array:
     # A hash, since XLA computes this anew wherever it is read: sines took 76 µs a step of 4,000 states, this takes 2.
     k = (jnp.arange(x.size, dtype=jnp.uint32) + 1) * jnp.uint32(0x9E3779B1)
     k = (k ^ (k >> 15)) * jnp.uint32(0x85EBCA77)
-    part = (k ^ (k >> 13)).astype(x.dtype) / 2**31 - 1.0  # −1 to 1
+    part = (k ^ (k >> 13)).astype(x.dtype) / 2.0**31 - 1.0  # −1 to 1
     return part + jnp.where(part < 0, -0.5, 0.5)
 
 
