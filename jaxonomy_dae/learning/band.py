@@ -90,7 +90,7 @@ def band(
     mean, slope = (np.asarray(a, float) for a in _law_and_slope(module, law, flat, points))
     c = objective.coordinates
     columns = np.array([g == name for g in c.group]) & c.is_weight
-    spread = np.linalg.norm((slope * c.size[columns]) @ estimate.root[columns], axis=1)
+    spread = np.linalg.norm(slope @ c.moved(estimate.point, estimate.root)[columns], axis=1)
     ends = explored(estimate, name, along)
     return Band(np.asarray(grid, float), mean, spread, mean - factor * spread, mean + factor * spread, ends)
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..aliases import PyTree
 from ..errors import ModelError, nearest
@@ -46,6 +46,15 @@ class Coordinate(NamedTuple):
     centre: float = 0.0
 
 
+class Shifts(NamedTuple):
+    """Coordinates that are values relative to others: the natural value at `into` is larger by `factor` times that at
+    `of`. A bias is measured where the inputs of its network have their centre."""
+
+    into: Int[np.ndarray | Array, " s"]
+    of: Int[np.ndarray | Array, " s"]
+    factor: Float[np.ndarray | Array, " s"]
+
+
 @dataclasses.dataclass(frozen=True)
 class Coordinates:
     """The `p` coordinates of a search, described by position.
@@ -68,6 +77,7 @@ class Coordinates:
     n_shared: int
     n_own: int  # of each experiment
     experiments: int
+    shifts: Shifts | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -90,7 +100,10 @@ class Coordinates:
 
     def scaled(self, natural: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """Natural values on the coordinates' scale."""
-        out = np.asarray(natural, float) / self.size
+        out = np.array(natural, float)
+        if self.shifts is not None:
+            np.subtract.at(out, self.shifts.into, self.shifts.factor * out[self.shifts.of])
+        out = out / self.size
         out[self.log] = np.log(out[self.log])
         return out
 
@@ -99,7 +112,10 @@ class Coordinates:
         out = np.array(z, float)
         with np.errstate(over="ignore"):
             out[self.log] = np.exp(out[self.log])
-        return np.clip(out * self.size, self.low, self.high)
+        out = np.clip(out * self.size, self.low, self.high)
+        if self.shifts is not None:
+            np.add.at(out, self.shifts.into, self.shifts.factor * out[self.shifts.of])
+        return out
 
     def natural_at(self, position: int, z: float) -> float:
         """The value that one coordinate stands for, bounds aside."""
@@ -107,8 +123,23 @@ class Coordinates:
             return float(np.exp(z)) if self.log[position] else float(z * self.size[position])
 
     def slope(self, z: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-        """d(natural value)/d(coordinate)."""
+        """d(natural value)/d(coordinate), of each by itself."""
         return np.where(self.log, self.natural(z), self.size)
+
+    def pulled(self, z: Float[np.ndarray, " p"], by_natural: Float[np.ndarray, "*m p"]) -> Float[np.ndarray, "*m p"]:
+        """Derivatives by the coordinates, from those by natural values."""
+        out = by_natural * self.slope(z)
+        if self.shifts is not None:
+            into, of, factor = self.shifts
+            out[..., of] += factor * by_natural[..., into] * self.size[of]
+        return out
+
+    def moved(self, z: Float[np.ndarray, " p"], changes: Float[np.ndarray, "p r"]) -> Float[np.ndarray, "p r"]:
+        """Changes of natural values, from those of coordinates."""
+        out = self.slope(z)[:, None] * changes
+        if self.shifts is not None:
+            np.add.at(out, self.shifts.into, self.shifts.factor[:, None] * out[self.shifts.of])
+        return out
 
     def split(self, natural: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
         """Returns (the values that all experiments share, those of each experiment's own, shape (experiments, own))."""
@@ -223,8 +254,9 @@ def coordinates(
     names, units, group = (tuple(columns.pop(name)) for name in ("name", "unit", "group"))
     arrays = {name: np.array(column) for name, column in columns.items()}
     return Coordinates(
-        names, units, group, **arrays, n_shared=n_shared, n_own=len(layout.own), experiments=len(stacked.labels)
-    ).with_priors(priors)
+        names, units, group, **arrays, n_shared=n_shared, n_own=len(layout.own), experiments=len(stacked.labels),
+        shifts=None,
+    ).with_priors(priors)  # fmt: skip
 
 
 def is_positive(interval: Interval) -> bool:

@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import ModelError
 from ..programs.cache import compiled
+from .coordinates import Shifts
 from .devices import each, each_with_slopes
 from .factors import Factors
 from .objective import Objective
@@ -58,6 +59,7 @@ class Posed(eqx.Module):
     chosen: Int[Array, " f"]  # those that are
     log: Bool[Array, " f"]
     size: Float[Array, " f"]
+    shifts: Shifts | None
     low: Float[Array, " f"]
     high: Float[Array, " f"]
     precision: Float[Array, " f"]
@@ -104,6 +106,8 @@ def numbers_at(posed: Posed, layout: Layout, z: Float[Array, " f"]) -> tuple[Flo
     """(shared, own) natural values as programs take them."""
     plain = z * posed.size
     natural = posed.natural.at[posed.chosen].set(jnp.where(posed.log, jnp.exp(jnp.where(posed.log, z, 0.0)), plain))
+    if posed.shifts is not None:
+        natural = natural.at[posed.shifts.into].add(posed.shifts.factor * natural[posed.shifts.of])
     e = posed.told.row.shape[0]
     split = len(natural) - e * layout.n_own
     return natural[:split], natural[split:].reshape(e, layout.n_own)
@@ -204,6 +208,7 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     told = Posed(
         told=objective.weighted, levels=levels, natural=array(c.natural(estimate.point)),
         chosen=jnp.asarray(np.flatnonzero(free)), log=jnp.asarray(c.log[free]), size=array(c.size[free]),
+        shifts=None if c.shifts is None else c.shifts._replace(factor=array(c.shifts.factor)),
         low=array(low), high=array(high), precision=array(weights.precision), mean=array(weights.mean),
         bends=array(bends), bend=array(bend), centre=array(centre), root=array(root),
     )  # fmt: skip

@@ -86,10 +86,9 @@ class Known:
 
     problem: Problem
     objective: Objective
-    natural: Float[np.ndarray, " p"]  # values of all coordinates
+    point: Float[np.ndarray, " p"]  # all coordinates
     information: Float[np.ndarray, "s s"]
     free: Bool[np.ndarray, " shared"]
-    scale: Float[np.ndarray, " shared"]
     chosen: Bool[np.ndarray, " s"]
 
     def worth(self, information: Float[np.ndarray, "s s"]) -> float:
@@ -126,9 +125,7 @@ def known_of(source: Problem | Estimate, names: Sequence[str] | str | None, alon
         jacobian = dataclasses.replace(weights, precision=np.zeros_like(prior)).applied(z, found).jacobian
         whole = jacobian.T @ jacobian + np.diag(prior)
         information = _without(whole, count)
-    natural = c.natural(objective.full(z))
-    scale = c.slope(objective.full(z))[: c.n_shared]
-    return Known(problem, objective, natural, information, shared, scale, _chosen(objective, shared, names))
+    return Known(problem, objective, objective.full(z), information, shared, _chosen(objective, shared, names))
 
 
 def _chosen(
@@ -221,10 +218,11 @@ def informations(known: Known, plans: list[Planned]) -> tuple[tuple[str, ...], F
             own_free = ~np.array([_is_known(stacked, name, k) for name in layout.own], bool)
             rows = []
             for by_shared, by_own in one:
-                a = np.zeros((int(seen.sum()), len(known.free)))
+                a = np.zeros((int(seen.sum()), len(known.point)))
                 a[:, column] = by_shared[k][seen]
+                a = known.objective.coordinates.pulled(known.point, a)[:, : len(known.free)]
                 b = by_own[k][seen] * starts[k]
-                rows.append(np.concatenate([(a * known.scale)[:, known.free], b[:, own_free]], axis=1))
+                rows.append(np.concatenate([a[:, known.free], b[:, own_free]], axis=1))
             whole = stacked.weight[k] * sum(r.T @ r for r in rows) / len(told)
             joint[k] = joint[k] + whole if len(joint[k]) else whole
     out, n = np.full((len(plans), *known.information.shape), np.nan), int(known.free.sum())
@@ -285,8 +283,8 @@ def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Shared
             "shared=True out"
         )
     at = _objective(known, layout, stacked)
-    own = at.coordinates.split(at.coordinates.start)[1]
-    return layout, stacked, *at.numbers(np.concatenate([known.natural[_columns(known, at.coordinates)], own.ravel()]))
+    own, natural = at.coordinates.split(at.coordinates.start)[1], o.coordinates.natural(known.point)
+    return layout, stacked, *at.numbers(np.concatenate([natural[_columns(known, at.coordinates)], own.ravel()]))
 
 
 def _objective(known: Known, layout: Layout, stacked: Stacked) -> Objective:

@@ -69,5 +69,5 @@ class Batches:
         off, by = weights.prior(z)
         pull, prior = by.T @ off, 0.5 * float(off @ off) / weights.samples
         cost = 0.5 * float(residual @ residual) / samples + prior
-        slope = (gradient * c.slope(full))[o.free] / samples + pull / weights.samples
+        slope = c.pulled(full, gradient)[o.free] / samples + pull / weights.samples
         return (cost, slope) if np.isfinite(cost) and np.isfinite(slope).all() else None

@@ -247,15 +247,16 @@ class Objective:
         run that counts fails."""
         full = self.full(z)
         found, variance = self._differentiated(full, self.counted)
-        slope = self.coordinates.slope(full)
+        c = self.coordinates
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             parts = [
                 found.outputs[self.rows] - self.stacked.values[self.rows],
-                (found.jacobian(self.rows) * slope)[:, self.free],
+                c.pulled(full, found.jacobian(self.rows))[:, self.free],
             ]
             if variance is not None:
                 s = variance.outputs[self.rows]
-                parts += [np.where(s > 0, s, np.nan), (variance.jacobian(self.rows) / s[:, None] * slope)[:, self.free]]
+                slope = c.pulled(full, variance.jacobian(self.rows) / s[:, None])
+                parts += [np.where(s > 0, s, np.nan), slope[:, self.free]]
         return Evaluation(*parts) if all(np.isfinite(a).all() for a in parts) else None
 
     def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
@@ -309,7 +310,7 @@ class Objective:
     def bends(self) -> Bends | None:
         """The derivatives of networks whose prior is smoothness."""
         c = self.coordinates
-        return Bends.of(self.laws, c.z_start, np.flatnonzero(self.free), c.size) if self.laws else None
+        return Bends.of(self.laws, c, np.flatnonzero(self.free)) if self.laws else None
 
     def lowest(
         self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None,

@@ -55,8 +55,7 @@ class Posterior:
         c = self.estimate.objective.coordinates
         if name in c.names:
             k = c.names.index(name)
-            z = self.points[..., k]
-            return np.clip(np.exp(z) if c.log[k] else z * c.size[k], c.low[k], c.high[k])
+            return np.apply_along_axis(c.natural, -1, self.points)[..., k]
         short = name.removeprefix("sigma of ")
         if short in self.sigma:
             return self.sigma[short]

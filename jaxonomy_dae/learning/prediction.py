@@ -93,8 +93,7 @@ def prediction(
     rows = tuple(a.ravel() for a in np.meshgrid([0], np.arange(n), np.arange(j), indexing="ij"))
     place = c.n_shared + k * c.n_own
     columns = np.concatenate([np.arange(c.n_shared), place + np.arange(c.n_own)])
-    slope = alone.jacobian(rows) * c.slope(point)[columns]
-    spread = np.linalg.norm(slope @ root[columns], axis=1).reshape(n, j)
+    spread = np.linalg.norm(alone.jacobian(rows) @ c.moved(point, root)[columns], axis=1).reshape(n, j)
     return Prediction.of(times, names, alone.outputs[0], spread, factor)
 
 
@@ -103,7 +102,7 @@ def at_samples(
 ) -> tuple[Float[np.ndarray, "e n k"], Float[np.ndarray, "e n k"]]:
     """All outputs at the samples' times, by the program of the fit, and their standard deviations."""
     c, found = objective.coordinates, objective.predicted(point)
-    moves = c.slope(point)[:, None] * root
+    moves = c.moved(point, root)
     shared, own = moves[: c.n_shared], moves[c.n_shared :].reshape(c.experiments, c.n_own, root.shape[1])
     along = found.by_shared @ shared + np.einsum("enko,eor->enkr", found.by_own, own)
     return found.outputs, np.linalg.norm(along, axis=-1)

@@ -278,7 +278,9 @@ class Problem:
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
         by_fit = isinstance(self.method, Filter) or not objective.stacked.holdout.any()
         best: tuple[float, Objective, Minimum, Training | None] | None = None
-        objective, own, fresh = in_ranges(objective, silent(objective, self._nominal(objective)))
+        objective, own, fresh = in_ranges(
+            objective, silent(objective, self._nominal(objective)), not isinstance(self.method, Shooting)
+        )
         points = starting_points(objective, own, fresh, starts, seed)
         for k, point in enumerate(points):
             training, spans = None, shares

@@ -5,10 +5,10 @@ all its hidden units are saturated; where it stays below 10⁻³ (metres), all a
 something else in each unit. So the search measures weights by what they do. With inputs of centre c and half range s,
 as the model's runs explore them without the network, and outputs of size o, the coordinates are those of
 
-    o·MLP((u − c)/s),
+    o·MLP((u − c)/s):
 
-up to biases of the first layer, which take up c: weights of the first layer in units of 1/s, biases there in units of
-√(1 + |c/s|²), and the last layer in units of o. The network itself stays what it is.
+weights of the first layer in units of 1/s, biases there as they act at u = c, and the last layer in units of o. The
+network itself stays what it is.
 
 Modules of a user's own bring their scales along, and so do networks with a prior of a given precision.
 """
@@ -21,38 +21,51 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from .coordinates import Shifts
 from .objective import Objective
 from .program import weights_of
 
 
 def in_ranges(
-    objective: Objective, quiet: Float[np.ndarray, " f"]
+    objective: Objective, quiet: Float[np.ndarray, " f"], is_centred: bool
 ) -> tuple[Objective, Float[np.ndarray, " f"], Float[np.ndarray, " f"]]:
     """(the objective with weights measured by what they do; the start of its search; the same start, but with the
     numbers of the networks taken as numbers for inputs and outputs of order one). `quiet`: a point at which networks
-    say nothing. Without raw networks, or where the model cannot be run there, nothing changes."""
+    say nothing. `is_centred`: whether biases are measured at the centre of inputs. Without raw networks, or where the
+    model cannot be run there, nothing changes."""
     c = objective.coordinates
     start = c.z_start[objective.free]
     places = {name: _places(objective, name) for name in objective.blocks}
     chosen = {name: at for name, at in places.items() if at is not None}
-    found = objective.evaluate(quiet) if chosen else None
+    seen = objective.seen(objective.full(quiet)) if chosen else {}
+    points = {name: seen[name][np.isfinite(seen[name]).all(axis=1)] for name in chosen}
+    if not any(map(len, points.values())):
+        return objective, start, start
+    size, fresh, shifts = np.array(c.size), np.array(c.start), []
+    chosen = {name: at for name, at in chosen.items() if len(points[name])}
+    ends = np.zeros(len(c), bool)  # weights of last layers
+    for name, at in chosen.items():
+        low, high = points[name].min(axis=0), points[name].max(axis=0)
+        net, centre = objective.system.neural[name], 0.5 * (low + high)
+        size[at], fresh[at] = _inner(net, centre, 0.5 * (high - low))
+        ends[at] = _of_last_layer(net)
+        if net.layers[0].bias is not None and is_centred:
+            shifts.append(_shifts(net, at, centre))
+    # What the last layers do is measured beside inner layers in their ranges: before, units of inputs decided it.
+    silent = dataclasses.replace(c, start=np.where(ends, 0.0, fresh)).z_start[objective.free]
+    found = objective.evaluate(silent)
     if found is None:
         return objective, start, start
-    weights = objective.weights(quiet, found)
-    rows = weights.row[:, None] * found.jacobian
+    weights = objective.weights(silent, found)
     misfit = float(np.linalg.norm(weights.row * found.residual))
-    seen = objective.seen(objective.full(quiet))
-    size, fresh = np.array(c.size), np.array(c.start)
+    effects = np.zeros(len(c))
+    effects[objective.free] = np.linalg.norm(weights.row[:, None] * found.jacobian, axis=0)
     for name, at in chosen.items():
-        points = seen[name][np.isfinite(seen[name]).all(axis=1)]
-        if not len(points):
-            continue
         net = objective.system.neural[name]
-        free = np.cumsum(objective.free)[at] - 1
-        effect = _like(net, np.linalg.norm(rows[:, free], axis=0))
-        low, high = points.min(axis=0), points.max(axis=0)
-        size[at], fresh[at] = _measured(net, 0.5 * (low + high), 0.5 * (high - low), effect.layers[-1], misfit)
-    measured = dataclasses.replace(c, size=size)
+        out = _outer(net, _like(net, effects[at]).layers[-1], misfit)
+        size[at], fresh[at] = size[at] * out, fresh[at] * out
+    joined = Shifts(*(np.concatenate(parts) for parts in zip(*shifts, strict=True))) if shifts else None
+    measured = dataclasses.replace(c, size=size, shifts=joined)
     begun = dataclasses.replace(measured, start=fresh)
     objective = dataclasses.replace(objective, coordinates=measured)
     return objective, measured.z_start[objective.free], begun.z_start[objective.free]
@@ -67,6 +80,13 @@ def _places(objective: Objective, name: str) -> Int[np.ndarray, " w"] | None:
     return at if objective.free[at].all() else None
 
 
+def _shifts(net: Any, at: Int[np.ndarray, " w"], centre: Float[np.ndarray, " inputs"]) -> Shifts:
+    """The coordinates of the first layer's biases, which are values at the centre: b = b' − W c."""
+    first = _like(net, at.astype(float)).layers[0]
+    into = np.repeat(first.bias.astype(int), len(centre))
+    return Shifts(into, first.weight.astype(int).ravel(), np.tile(-centre, len(first.bias)))
+
+
 def _like(net: Any, numbers: Float[np.ndarray, " w"]) -> Any:
     """The network with these numbers in place of its trained ones, as NumPy arrays."""
     leaves, structure = jax.tree.flatten(eqx.filter(net, eqx.is_inexact_array))
@@ -75,29 +95,43 @@ def _like(net: Any, numbers: Float[np.ndarray, " w"]) -> Any:
     return jax.tree.unflatten(structure, parts)
 
 
-def _measured(
-    net: Any, centre: Float[np.ndarray, " inputs"], spread: Float[np.ndarray, " inputs"], effect: Any, misfit: float
+def _inner(
+    net: Any, centre: Float[np.ndarray, " inputs"], spread: Float[np.ndarray, " inputs"]
 ) -> tuple[Float[np.ndarray, " w"], Float[np.ndarray, " w"]]:
-    """(the units of a network's numbers; its numbers, taken as those for inputs and outputs of order one).
-
-    - `effect`: the last layer, with the norm of what one of its numbers changes residuals by; `misfit`: the norm of
-        residuals without the network. Outputs are as large as would change as much as there is to explain.
-    """
+    """(the units of a network's numbers; its numbers, with a first layer taken as one for inputs of order one)."""
     spread = np.where(spread > 0, spread, np.where(centre != 0, np.abs(centre), 1.0))
     numbers = _like(net, _flat(weights_of(net)).astype(float))
     units = jax.tree.map(np.ones_like, numbers)
-    first, unit = numbers.layers[0], units.layers[0]
-    unit.weight[...] = 1 / spread
+    first = numbers.layers[0]
+    units.layers[0].weight[...] = 1 / spread
     first.weight[...] = first.weight / spread
     if first.bias is not None:
-        unit.bias[...] = np.sqrt(1 + np.sum((centre / spread) ** 2))
         first.bias[...] = first.bias - first.weight @ centre
+    return _flat(units), _flat(numbers)
+
+
+def _outer(net: Any, effect: Any, misfit: float) -> Float[np.ndarray, " w"]:
+    """The units of a network's last layer, and one for its other numbers. Outputs are as large as would change as much
+    as there is to explain.
+
+    - `effect`: the last layer, with the norm of what one of its numbers changes residuals by; `misfit`: the norm of
+        residuals without the network.
+    """
     squares = np.mean(effect.weight**2, axis=1)
     with np.errstate(divide="ignore"):
         out = np.where((squares > 0) & (misfit > 0), misfit / np.sqrt(squares), 1.0)
-    for a in jax.tree.leaves((units.layers[-1], numbers.layers[-1])):
+    units = _like(net, np.ones(len(_flat(weights_of(net)))))
+    for a in jax.tree.leaves(units.layers[-1]):
         a[...] = (a.T * out).T
-    return _flat(units), _flat(numbers)
+    return _flat(units)
+
+
+def _of_last_layer(net: Any) -> np.ndarray:
+    """True for the numbers of the last layer."""
+    marks = _like(net, np.zeros(len(_flat(weights_of(net)))))
+    for a in jax.tree.leaves(marks.layers[-1]):
+        a[...] = 1.0
+    return _flat(marks) > 0
 
 
 def _flat(tree: Any) -> Float[np.ndarray, " w"]:

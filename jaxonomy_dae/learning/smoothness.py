@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from ..model.opaque import OpaqueFunction
 from ..programs.cache import compiled
+from .coordinates import Coordinates
 from .program import with_weights
 
 ORDERS = (2, 3)  # of derivatives: those of a piecewise linear law, and of a parabola, cost nothing or little
@@ -42,44 +43,41 @@ class Law(NamedTuple):
 class Bends:
     """The derivatives h of some laws as functions of all coordinates, row by row.
 
-    - `base`, `free`, `size`: all coordinates, which of them are searched, and their units.
+    - `coordinates`, `free`: all coordinates, and which of them are searched.
     - `group`: the group of each row, of which each has a precision; `owner`: the law of each group.
     """
 
     laws: tuple[Law, ...]
-    base: Float[np.ndarray, " p"]
+    coordinates: Coordinates
     free: Int[np.ndarray, " f"]
-    size: Float[np.ndarray, " p"]
     group: Int[np.ndarray, " r"]
     owner: Int[np.ndarray, " g"]
     last: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls, laws: tuple[Law, ...], base: Float[np.ndarray, " p"], free: Int[np.ndarray, " f"],
-        size: Float[np.ndarray, " p"],
-    ) -> "Bends":  # fmt: skip
+    def of(cls, laws: tuple[Law, ...], coordinates: Coordinates, free: Int[np.ndarray, " f"]) -> "Bends":
         """The derivatives of these laws."""
         counts = [len(law.points) * len(directions(len(law.size))) for law in laws]
         outputs = [_outputs(law) for law in laws]
         owner = np.repeat(np.arange(len(laws)), [n * len(ORDERS) for n in outputs])
         group = np.repeat(np.arange(len(owner)), [counts[k] for k in owner])
-        return cls(laws, base, free, size, group, owner)
+        return cls(laws, coordinates, free, group, owner)
 
     def at(self, z: Float[np.ndarray, " f"]) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r f"]]:
         """(h, its derivatives by the free coordinates), each divided by the root of the number of its group's rows."""
         if self.last and np.array_equal(self.last["z"], z):
             return self.last["found"]
-        full = np.array(self.base)
+        full = self.coordinates.z_start
         full[self.free] = z
+        natural = self.coordinates.natural(full)
         values, slopes = [], []
         for law in self.laws:
             dtype = jnp.asarray(law.points).dtype
-            unit = self.size[law.columns]
-            given = (jnp.asarray(a, dtype) for a in (full[law.columns] * unit, law.points, law.size))
+            given = (jnp.asarray(a, dtype) for a in (natural[law.columns], law.points, law.size))
             found, slope = (np.asarray(a, np.float64) for a in _bends(law.module, law.opaque, *given))
             wide = np.zeros((*slope.shape[:-1], len(full)))
-            wide[..., law.columns] = slope * unit
+            wide[..., law.columns] = slope
+            wide = self.coordinates.pulled(full, wide)
             root = np.sqrt(np.prod(found.shape[:-2]))
             rows = np.moveaxis(found, (-2, -1), (0, 1)).reshape(-1)  # by output, then order
             values.append(rows / root)

@@ -255,7 +255,7 @@ def _facts(objective: Objective, plan: GradientSteps, optimizer: optax.OptState)
         dict(s.inputs),
         repr(s.starts),
     ]
-    searched = [np.array(objective.free), c.low, c.high, c.start[~objective.free], c.size, c.spread, c.centre]
+    searched = [np.array(objective.free), c.low, c.high, c.start[~objective.free], c.size, c.spread, c.centre, c.shifts]
     functions = [objective.system.neural, objective.observers]
     return {
         "model": objective.system.plan.digest,

@@ -72,7 +72,8 @@ class Unseen:
         own = whole if first is None else whole.first_rows(first)
         point, places = whole.coordinates.z_start, [estimate.position(c.names[k]) for k in shared]
         root = np.zeros((len(point), estimate.root.shape[1]))
-        root[shared] = estimate.root[places]
+        moves = fitted.coordinates.moved(estimate.point, estimate.root)[places]
+        root[shared] = moves / c.slope(point)[shared][:, None]
         if not own.free.any():
             return cls(whole, point, root)
         found = own.lowest(point[own.free])
@@ -91,8 +92,9 @@ class Unseen:
         factors = Factors.of(np.zeros(len(by_own)), by_own, found.noise)
         alone = factors.root(factors.rank(found.noise))
         root = np.concatenate([root, np.zeros((len(point), alone.shape[1]))], axis=1)
-        root[free, : estimate.root.shape[1]] = -alone @ (alone.T @ (by_own.T @ (by_shared @ estimate.root[places])))
-        root[free, estimate.root.shape[1] :] = alone
+        count = estimate.root.shape[1]
+        root[free, :count] = -alone @ (alone.T @ (by_own.T @ (by_shared @ root[shared, :count])))
+        root[free, count:] = alone
         return cls(whole, point, root)
 
     def score(self) -> Score:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
+from jaxonomy_dae.learning.coordinates import Coordinates
 from jaxonomy_dae.learning.evaluation import Evaluation, Weights
 from jaxonomy_dae.learning.evidence import Evidence, log_evidence
 from jaxonomy_dae.learning.factors import Factors
@@ -36,7 +37,13 @@ class Plane(eqx.Module):
 def bends_of(module, points, size):
     opaque, count = OpaqueFunction(0, "f", None, points.shape[1], frozenset()), len(module.weights)
     law = Law(module, opaque, np.arange(count), points, size)
-    return Bends.of((law,), np.zeros(count), np.arange(count), np.ones(count))
+    none, zeros, flags = np.full(count, np.inf), np.zeros(count), np.zeros(count, bool)
+    names = tuple(f"w[{k}]" for k in range(count))
+    weights = Coordinates(
+        names, ("",) * count, ("f",) * count, ~flags, flags, np.ones(count), zeros, -none, none, none, zeros, flags,
+        n_shared=count, n_own=0, experiments=1,
+    )  # fmt: skip
+    return Bends.of((law,), weights, np.arange(count))
 
 
 def test_derivatives_along_directions():

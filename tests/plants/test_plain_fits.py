@@ -170,20 +170,22 @@ class InUnits(Component):
 
 @pytest.mark.long("residuals with and without their Jacobian, four fits")
 def test_units_of_a_network_s_inputs_and_outputs_do_not_matter():
-    """An input in mm/s saturated every hidden unit, and the search did not end."""
+    """An input in mm/s saturated every hidden unit, and the search did not end. One with an offset of 300 half ranges
+    was lost (21 %): its bias and its weights did the same."""
     ev, diagram = EqnEnv(), AcausalDiagram()
     diagram.add(InUnits(ev, "c"))
     system, grid, laws = AcausalCompiler(ev, diagram)(), np.linspace(-0.5, 0.35, 10), []
-    for k, o, f in ((1.0, 0.0, 1.0), (1e3, 0.0, 1e4), (1e-3, 0.0, 1e-4), (1e5, 1e6, 1.0)):
+    for k, o, f in ((1.0, 0.0, 1.0), (1e3, 0.0, 1e4), (1e-3, 0.0, 1e-4), (1e5, 1.3e7, 1.0)):
         there = system.with_parameters({"c.K": k, "c.O": o, "c.F": f})
         fit = learning.Problem(there, record(seed=3), train=["c.f"]).fit()
         band = fit.band("c.f", k * grid + o)
         assert fit.ok and band.inside.all()
         np.testing.assert_array_less(np.abs(f * band.mean + 0.3 * grid), 3.5 * f * band.spread)
         laws.append((f * band.mean, f * band.spread))
-    for mean, spread in laws[1:]:
-        np.testing.assert_array_less(np.abs(mean - laws[0][0]), 0.5 * laws[0][1])
-        np.testing.assert_allclose(spread, laws[0][1], rtol=0.5)
+    for mean, spread in laws[1:]:  # the first begins at its own weights, the others at those in ranges
+        np.testing.assert_array_less(np.abs(mean - laws[0][0]), 0.05 * laws[0][1])
+        np.testing.assert_allclose(mean, laws[1][0], rtol=1e-6)
+        np.testing.assert_allclose(spread, laws[1][1], rtol=1e-5)
 
 
 @pytest.mark.slow
