@@ -202,13 +202,7 @@ def _values(system: AcausalSystem, name: str, given: object) -> Any:
         raise ModelError(f"the values of parameter '{name}' need shape (k,){either}, k ≥ 1; got {values.shape}")
     places = np.array([table.settable(one) for one in table.one_by_one(name)])
     if not isinstance(values, Tracer):
-        low, high = table.bounds[places].T
-        numbers = np.broadcast_to(np.asarray(values).reshape(len(values), -1), (len(values), len(places)))
-        wrong = np.argwhere(~(np.isfinite(numbers) & (numbers >= low) & (numbers <= high)))
-        if len(wrong):
-            k = int(places[wrong[0, 1]])
-            got = numbers[tuple(wrong[0])]
-            raise ModelError(f"parameter '{table.names[k]}' must lie in {table.intervals[k]}; got {got:g}")
+        table.check(places, np.asarray(values).reshape(len(values), -1))
     return values
 
 

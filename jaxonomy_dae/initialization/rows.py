@@ -10,7 +10,7 @@ equations and the rows before it leave open.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -150,8 +150,24 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
             settled=(), dropped=(),
         )  # fmt: skip
     generic = _generic(plan, solve_for)
-    ranked = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
-    return ranked(plan, generic, overrides, fixed, guess, _ranks(plan, guess, others) if ranks is None else ranks)
+    judge = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
+    closes, follows, soft, unshared = judge(plan, generic, rows, ranks or _ranks(plan, guess, others))
+    # What the caller gave outranks other starts, unless these follow whatever is given.
+    is_dropped = [
+        bool(overrides) and r.given < 0 and not c and not f for r, c, f in zip(rows, closes, follows, strict=True)
+    ]
+    kept = [k for k, gone in enumerate(is_dropped) if not gone]
+    return InitialRows(
+        guess=guess,
+        kept=(*(rows[k] for k in kept), *(row for row, _ in soft)),
+        n_soft=len(soft),
+        independent=(*(closes[k] for k in kept), *(alone for _, alone in soft)),
+        direct=False,
+        redundant=tuple(place for place, k in enumerate(kept) if not closes[k]),
+        settled=tuple(place for place, k in enumerate(kept) if follows[k]),
+        dropped=tuple(row.name for row, gone in zip(rows, is_dropped, strict=True) if gone),
+        unshared=unshared,
+    )
 
 
 def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[StartRow], list[StartRow], dict[int, StartRow]]:
@@ -281,6 +297,16 @@ def _are_states(ranks: Sequence[_Rank], states: set[int]) -> bool:
     return True
 
 
+class _Judged(NamedTuple):
+    """Of rows that must hold, those that close a direction, and those that follow from equations alone; guesses, and
+    whether each closes a direction; guesses that gave way, though they should share."""
+
+    closes: list[bool]
+    follows: list[bool]
+    soft: list[tuple[StartRow, bool]]
+    unshared: tuple[str, ...] = ()
+
+
 class _Directions:
     """The directions that equations leave open, shape (columns, freedom), closed one by one.
 
@@ -318,74 +344,52 @@ class _Directions:
         return True
 
 
-def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, ranks: Sequence[_Rank]) -> InitialRows:
+def _by_rank(plan: SystemPlan, generic: _Generic, hard: Sequence[StartRow], ranks: Sequence[_Rank]) -> _Judged:
+    """The choice of rows for few quantities: each closes a direction that those before it leave open, or none."""
     directions = _Directions(generic)
-    kept, independent, dropped, settled = [], [], [], []
-    alone = [not directions.open(generic.row(row)) for row in (*overrides, *fixed)]  # whatever is given
-    for row, follows in zip((*overrides, *fixed), alone, strict=True):
-        closes = directions.close(generic.row(row))
-        if not closes and overrides and not follows and row.given < 0:
-            dropped.append(row.name)  # what the caller gave outranks it
-            continue
-        if follows:
-            settled.append(len(kept))
-        kept.append(row)
-        independent.append(closes)
-    redundant = tuple(k for k, closes in enumerate(independent) if not closes)
+    follows = [not directions.open(generic.row(row)) for row in hard]
+    closes = [directions.close(generic.row(row)) for row in hard]
     soft: list[tuple[StartRow, bool]] = []
     for rank in ranks:
         gradients = [generic.row(dataclasses.replace(row, start=None)) for row in rank.rows]
         undecided = [directions.open(gradient) for gradient in gradients]
         for row, gradient, is_open in zip(rank.rows, gradients, undecided, strict=True):
-            closes = is_open and directions.close(gradient)
-            if closes or (is_open and rank.shares):
-                soft.append((row, closes))
+            alone = is_open and directions.close(gradient)
+            if alone or (is_open and rank.shares):
+                soft.append((row, alone))
     if generic.solve_for:
-        _check_count(plan, generic, directions, [kept[k] for k in redundant], [*kept, *(row for row, _ in soft)])
-    return _chosen(guess, kept, independent, soft, redundant, tuple(settled), dropped)
+        redundant = [row for row, alone in zip(hard, closes, strict=True) if not alone]
+        _check_count(plan, generic, directions, redundant, [*hard, *(row for row, _ in soft)])
+    return _Judged(closes, follows, soft)
 
 
-def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, ranks: Sequence[_Rank]) -> InitialRows:
+def _by_matching(plan: SystemPlan, generic: _Generic, hard: Sequence[StartRow], ranks: Sequence[_Rank]) -> _Judged:
     """The choice of rows for many quantities: a row is independent if it can be matched with a quantity beside the
     equations and the rows before it, and if numbers do not say otherwise."""
-    rows = [*overrides, *fixed, *(row for rank in ranks for row in rank.rows)]
-    hard = len(overrides) + len(fixed)
-    n_equations = generic.jacobian.shape[0]
-    bare = [row if k < hard else dataclasses.replace(row, start=None) for k, row in enumerate(rows)]
-    gradients = generic.rows(bare)
+    guesses, n = [row for rank in ranks for row in rank.rows], len(hard)
+    n_equations, n_columns = generic.jacobian.shape
+    gradients = generic.rows([*hard, *(dataclasses.replace(row, start=None) for row in guesses)])
     pointer = np.concatenate([generic.jacobian.indptr, generic.jacobian.nnz + gradients.indptr[1:]])
     columns = np.concatenate([generic.jacobian.indices, gradients.indices]).astype(np.int64)
-    column = match_in_order(pointer, columns, generic.jacobian.shape[1], n_equations)
-    matched = column[n_equations:] >= 0
-    shares = _sharing(pointer, columns, column, n_equations + hard, ranks, generic.jacobian.shape[1])
-    unshared: tuple[str, ...] = ()
+    column = match_in_order(pointer, columns, n_columns, n_equations)
+    shares = _sharing(pointer, columns, column, n_equations + n, ranks, n_columns)
+    matched, settled, unshared = column[n_equations:] >= 0, np.zeros(0, np.int64), np.zeros(len(guesses), bool)
     if plan.n_state > DENSE_UPTO:
-        unshared = tuple(
-            row.name for row, share, m in zip(rows[hard:], shares, matched[hard:], strict=True) if share > m
-        )
-        shares[:] = False
-    missing = generic.jacobian.shape[1] - n_equations - int(matched.sum())
-    settled = np.zeros(0, np.int64)
+        shares, unshared = unshared, shares & ~matched[n:]
+    missing = n_columns - n_equations - int(matched.sum())
     if not missing:
-        matched, settled = _exchanged(generic, gradients, matched, hard)
-    is_dropped = [
-        bool(overrides) and row.given < 0 and not m and k not in settled
-        for k, (row, m) in enumerate(zip(rows[:hard], matched, strict=False))
-    ]
-    kept = [row for row, gone in zip(rows[:hard], is_dropped, strict=True) if not gone]
-    independent = [bool(m) for m, gone in zip(matched[:hard], is_dropped, strict=True) if not gone]
-    redundant = tuple(k for k, alone in enumerate(independent) if not alone)
-    guesses = zip(rows[hard:], matched[hard:].tolist(), shares.tolist(), strict=True)
-    soft = [(row, m) for row, m, shared in guesses if m or shared]
-    if generic.solve_for and (missing or any(rows[k].given >= 0 for k in redundant)):
+        matched, settled = _exchanged(generic, gradients, matched, n)
+    closes = matched.tolist()
+    if generic.solve_for and (missing or any(row.given >= 0 and not c for row, c in zip(hard, closes, strict=False))):
         unknown = quoted([plan.flat.parameters.names[p] for p in generic.solve_for])
         what = "too few" if missing else "too many"
         raise InitializationError(f"solve_for: {what} values in initial={{...}} to determine {unknown}")
-    dropped = [row.name for row, gone in zip(rows[:hard], is_dropped, strict=True) if gone]
-    alone = {rows[k].name for k in settled.tolist() if k < hard}
-    follows = tuple(k for k, row in enumerate(kept) if row.name in alone)
-    chosen = _chosen(guess, kept, independent, soft, redundant, follows, dropped)
-    return dataclasses.replace(chosen, unshared=unshared)
+    return _Judged(
+        closes[:n],
+        np.isin(np.arange(n), settled).tolist(),
+        [(row, c) for row, c, shared in zip(guesses, closes[n:], shares.tolist(), strict=True) if c or shared],
+        tuple(row.name for row, gone in zip(guesses, unshared.tolist(), strict=True) if gone),
+    )
 
 
 def _sharing(
@@ -442,15 +446,6 @@ def _weights_of(rank: Any, gradients: Any, n_equations: int) -> np.ndarray:
         weight = np.abs(rank.factors.solve(gradients[[k]].toarray()[0] * rank.c, trans="T"))
         out[k] = weight[n_equations:] > NO_PART * max(weight.max(initial=0.0), TINY)
     return out
-
-
-def _chosen(guess, kept: list[StartRow], independent: list[bool], soft, redundant, settled, dropped) -> InitialRows:
-    alone = (*independent, *(closes for _, closes in soft))
-    rows = (*kept, *(row for row, _ in soft))
-    return InitialRows(
-        guess=guess, kept=rows, n_soft=len(soft), independent=alone, direct=False, redundant=redundant,
-        settled=settled, dropped=tuple(dropped),
-    )  # fmt: skip
 
 
 # --- what follows from what ----------------------------------------------------------------------------------------

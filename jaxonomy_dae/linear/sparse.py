@@ -88,6 +88,13 @@ class SparsePattern:
             return None
         return SparsePattern(places // max(self.n, 1), places % max(self.n, 1), self.n, self.n_rows), inverse
 
+    def merged(self, values: Float[Array, " nnz"]) -> tuple["SparsePattern", Float[Array, " places"]]:
+        """The pattern with every place once, and the values there; values at the same place add up."""
+        if self.coalesced is None:
+            return self, values
+        pattern, inverse = self.coalesced
+        return pattern, jnp.zeros(len(pattern), values.dtype).at[inverse].add(values)
+
     @functools.cached_property
     def colors(self) -> np.ndarray:
         """A colour for every column, such that columns of one colour share no row.
@@ -218,16 +225,11 @@ def solve_sparse(
     """
     if pattern.n_rows != pattern.n:
         raise ModelError(f"a matrix to be solved with must be square; this one is {pattern.n_rows} × {pattern.n}")
-    if not is_double():
-        raise ModelError(
-            "sparse solves compute in float64: call jax.config.update('jax_enable_x64', True) at the start"
-        )
+    _check_double()
     klu()
     if not pattern.n:
         return b
-    if pattern.coalesced is not None:
-        pattern, inverse = pattern.coalesced
-        values = jnp.zeros(len(pattern), values.dtype).at[inverse].add(values)
+    pattern, values = pattern.merged(values)
 
     def matvec(x):
         return pattern.multiply(values, x, transpose)
@@ -246,14 +248,15 @@ def factorised_solve(
 ) -> Float[Array, " n"]:
     """As `solve_sparse`, without derivatives."""
     klu()
+    _check_double()
+    return _factorized(*pattern.merged(values), b, transpose, False)
+
+
+def _check_double():
     if not is_double():
         raise ModelError(
             "sparse solves compute in float64: call jax.config.update('jax_enable_x64', True) at the start"
         )
-    if pattern.coalesced is not None:
-        pattern, inverse = pattern.coalesced
-        values = jnp.zeros(len(pattern), values.dtype).at[inverse].add(values)
-    return _factorized(pattern, values, b, transpose, False)
 
 
 ULPS = 16  # changes of entries, in units of their rounding

@@ -47,9 +47,7 @@ def solve_whole(
 
     **Raises:** `ModelError` if there are too many unknowns for dense elimination and KLU is not available.
     """
-    if pattern.coalesced is not None:
-        pattern, inverse = pattern.coalesced
-        values = jnp.zeros(len(pattern), values.dtype).at[inverse].add(values)
+    pattern, values = pattern.merged(values)
     n = pattern.n
     by_lapack = solver is None and (n <= LAPACK or not (is_double() and available()))
     if by_lapack:

@@ -44,6 +44,15 @@ class ColumnSets:
     pointer: np.ndarray
     columns: np.ndarray
 
+    def of(self, rows: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """The lengths of some rows, and their columns one row after the other; at most so many."""
+        start = self.pointer[rows]
+        length = self.pointer[rows + 1] - start
+        if int(length.sum()) > most:
+            raise TooDense
+        first = np.cumsum(length) - length
+        return length, self.columns[np.repeat(start - first, length) + np.arange(int(length.sum()))]
+
 
 class Dependencies:
     """The rows of all quantities computed so far. `refined` tells whether the tearing variables of nonlinear blocks are
@@ -79,14 +88,8 @@ class Dependencies:
         for s in np.unique(segment[segment >= 0]).tolist():
             here = np.flatnonzero(segment == s)
             rows = self.segments[s]
-            row = self.row[quantity[here]]
-            start = rows.pointer[row]
-            length = rows.pointer[row + 1] - start
-            total = int(length.sum())
-            if self.entries + total > LIMIT:
-                raise TooDense
-            first = np.cumsum(length) - length
-            columns.append(rows.columns[np.repeat(start - first, length) + np.arange(total)])
+            length, found = rows.of(self.row[quantity[here]], LIMIT - self.entries)
+            columns.append(found)
             owners.append(np.repeat(owner[here], length))
         for column in own:
             columns.append(np.asarray(column, np.int32))
@@ -207,12 +210,7 @@ def rate_entries(
     states its block reads, and on what their derivatives depend on."""
     direct = entries([dependencies.of(carried)])
     inside = direct[1] < n_states
-    start = slopes.pointer[direct[1][inside]]
-    length = slopes.pointer[direct[1][inside] + 1] - start
-    if int(length.sum()) > LIMIT:
-        raise TooDense
-    first = np.cumsum(length) - length
-    through = slopes.columns[np.repeat(start - first, length) + np.arange(int(length.sum()))]
+    length, through = slopes.of(direct[1][inside], LIMIT)
     rows = np.concatenate([direct[0], np.repeat(direct[0][inside], length)])
     columns = np.concatenate([direct[1], through])
     return unique_entries(rows, columns, dependencies.width)

@@ -1,7 +1,7 @@
 """What a name without indices means in a model with arrays of components: `cell.v` is all of `cell[0].v`, …"""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -40,25 +40,25 @@ class ArrayNames:
 
     def dimensions(self, name: str) -> tuple[str, ...]:
         """Names of the dimensions of an array of variables: the paths of the arrays that the name leaves whole."""
-        pieces = name.split(".")
-        for cut in range(len(pieces) - 1, 0, -1):
-            bare = [p.partition("[")[0] for p in pieces[:cut]]
-            entry = self.entries.get(".".join(bare))
-            own = ".".join(pieces[cut:])
-            if entry is not None and (own in entry.variable_positions or own in entry.parameter_positions):
-                whole = [(".".join(bare[: level + 1]), n) for level, n in entry.levels if "[" not in pieces[level]]
+        for entry, path, own in self._parts(name):
+            if own in entry.variable_positions or own in entry.parameter_positions:
+                bare = [piece.partition("[")[0] for piece in path]
+                whole = [(".".join(bare[: level + 1]), n) for level, n in entry.levels if "[" not in path[level]]
                 return tuple(p if n == 1 else f"{p}_{k}" for p, n in whole for k in range(n))
         return ()
 
-    def _find(self, name: str, variables: bool) -> np.ndarray | None:
+    def _parts(self, name: str) -> Iterator[tuple[ArrayEntry, list[str], str]]:
+        """The components that a name may begin with: (the component, its path in the name, what follows)."""
         pieces = name.split(".") if self.entries else []
         for cut in range(len(pieces) - 1, 0, -1):
             entry = self.entries.get(".".join(p.partition("[")[0] for p in pieces[:cut]))
-            if entry is None:
-                continue
-            own = ".".join(pieces[cut:])
+            if entry is not None:
+                yield entry, pieces[:cut], ".".join(pieces[cut:])
+
+    def _find(self, name: str, variables: bool) -> np.ndarray | None:
+        for entry, path, own in self._parts(name):
             positions = entry.variable_positions if variables else entry.parameter_positions
-            index = _index(entry, pieces[:cut])
+            index = _index(entry, path)
             if own not in positions or index is None:
                 continue
             ids = (entry.variable if variables else entry.parameter) + positions[own]

@@ -103,6 +103,20 @@ class ParameterNames:
         """The bounds of each parameter, shape (n,)."""
         return Ends.of(self.intervals)
 
+    def check(self, entries: np.ndarray, values: Float[np.ndarray, "*batch"]) -> None:
+        """Checks values of parameters at indices, in whose shape their trailing axes are.
+
+        **Raises:**
+
+        - `ModelError` for the first one that is not finite, or out of its bounds.
+        """
+        numbers = np.broadcast_to(values, np.broadcast_shapes(values.shape, entries.shape))
+        wrong = np.argwhere(~self.ends.take(entries).admit(numbers))
+        if len(wrong):
+            k = int(np.broadcast_to(entries, numbers.shape)[tuple(wrong[0])])
+            got = numbers[tuple(wrong[0])]
+            raise ModelError(f"parameter '{self.names[k]}' must lie in {self.intervals[k]}; got {got:g}")
+
     def chosen(self, names: Iterable[str]) -> dict[str, np.ndarray]:
         """The indices of parameters that can be set, by their names and those of arrays, in the arrays' shapes.
 
@@ -308,9 +322,8 @@ class Parameters(eqx.Module):
             raise ModelError(f"{where} must be a real number; got the complex number {value}")
         if isinstance(value, Tracer):
             return value
-        for number in np.ravel(np.asarray(value)):
-            if real_number(number, where) not in self.table.intervals[k]:
-                raise ModelError(f"{where} must lie in {self.table.intervals[k]}; got {float(number):g}")
+        numbers = np.array([real_number(number, where) for number in np.ravel(np.asarray(value))])
+        self.table.check(np.array(k), numbers)
         return value
 
     def _checked_array(self, name: str, entries: np.ndarray, value: Any, batch: tuple[int, ...]) -> Any:
@@ -323,15 +336,7 @@ class Parameters(eqx.Module):
             raise ModelError(f"{where} must be real; got {jnp.result_type(value)}")
         if isinstance(value, Tracer):
             return value
-        low, high = np.moveaxis(self.table.bounds[entries], -1, 0)
-        numbers = np.broadcast_to(np.asarray(value, np.float64), np.broadcast_shapes(shape, entries.shape))
-        right = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
-        if not right.all():
-            at = tuple(np.argwhere(~right)[0])
-            k = int(entries[at[len(at) - entries.ndim :]])
-            raise ModelError(
-                f"parameter '{self.table.names[k]}' must lie in {self.table.intervals[k]}; got {numbers[at]:g}"
-            )
+        self.table.check(entries, np.asarray(value, np.float64))
         return value
 
     @property

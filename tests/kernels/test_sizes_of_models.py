@@ -55,6 +55,7 @@ class Nearly(Component):
         )  # fmt: skip
 
 
+@pytest.mark.long("compiles the sparse search of starts, with the dense one behind it")
 @pytest.mark.parametrize("n, is_sparse", [(2, False), (3, True)])
 def test_starts_that_hardly_determine_the_point(monkeypatch, n, is_sparse):
     """From 128 unknowns on, whose rows are sparse, nothing was said of the condition of the initial equations."""
