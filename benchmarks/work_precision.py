@@ -20,6 +20,7 @@ absolute; they end where the reference does. Times: the first call with all comp
 import argparse
 import math
 import sys
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -40,7 +41,8 @@ OTHERS = {
 }
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 SMALL = 30  # unknowns up to which times are compared with IDAS
-IDA_FAMILY = ("ida", "idas", "idas-full")
+IDAS = ("idas", "idas-full")
+IDA_FAMILY = ("ida", *IDAS)
 
 
 def our_solver(name: str):
@@ -96,12 +98,14 @@ def line(problem: Problem, name: str, form: str, rtol: float, outcome: Outcome) 
     )
 
 
-def steps_at(problem: Problem, results: dict[float, Outcome], digits: np.ndarray) -> np.ndarray:
-    """The steps it takes for so many digits: log₁₀(steps) interpolated over the digits of the runs, NaN outside."""
+def at_digits(
+    problem: Problem, results: dict[float, Outcome], digits: np.ndarray, cost: Callable[[Outcome], float]
+) -> np.ndarray:
+    """What so many digits cost: log₁₀(cost) interpolated over the digits of the runs, NaN outside."""
     known = sorted(
-        (digits_of(problem, o), math.log10(o.steps))
+        (digits_of(problem, o), math.log10(cost(o)))
         for o in results.values()
-        if not o.failure and o.steps > 0 and digits_of(problem, o) < problem.digits
+        if not o.failure and cost(o) > 0 and digits_of(problem, o) < problem.digits
     )
     if len(known) < 2:
         return np.full(len(digits), np.nan)
@@ -109,27 +113,34 @@ def steps_at(problem: Problem, results: dict[float, Outcome], digits: np.ndarray
     return 10 ** np.interp(digits, x, y, left=np.nan, right=np.nan)
 
 
-def summary(problems, table) -> None:
-    """Steps relative to IDA at equal digits, times relative to IDAS at equal tolerance."""
-    print("\nSteps for equal digits, relative to the best of IDA and IDAS (geometric mean over the digits both reach)")
+def at_equal_digits(problems, table, rivals, cost: Callable[[Outcome], float]) -> None:
+    """Our costs relative to those of the best rival at equal digits: geometric means over the digits both reach."""
     digits = np.arange(1.0, 12.01, 0.25)
     for problem in problems:
-        others = [steps_at(problem, table[problem.name, n], digits) for n in IDA_FAMILY if (problem.name, n) in table]
-        if not others:
-            continue
-        best = np.fmin.reduce(others)
-        for name in OURS:
+        others = [
+            at_digits(problem, table[problem.name, n], digits, cost) for n in rivals if (problem.name, n) in table
+        ]
+        for name in OURS if others else ():
             if (problem.name, name) in table:
-                ratio = steps_at(problem, table[problem.name, name], digits) / best
+                ratio = at_digits(problem, table[problem.name, name], digits, cost) / np.fmin.reduce(others)
                 both = np.isfinite(ratio)
                 if both.any():
                     mean, low, high = np.exp(np.log(ratio[both]).mean()), ratio[both].min(), ratio[both].max()
                     span = f"{digits[both].min():.1f} to {digits[both].max():.1f} digits"
                     print(f"  {problem.name:22}{name:10}{mean:6.2f}   ({low:.2f} to {high:.2f}; {span})")
+
+
+def summary(problems, table) -> None:
+    """Steps relative to IDA and times relative to IDAS at equal digits, times relative to IDAS at equal tolerance."""
+    print("\nSteps for equal digits, relative to the best of IDA and IDAS (geometric mean over the digits both reach)")
+    at_equal_digits(problems, table, IDA_FAMILY, lambda o: o.steps)
+    small = [p for p in problems if len(p.index_one().y0) <= SMALL]
+    print(f"\nSteady time for equal digits, relative to IDAS (the faster variant), up to {SMALL} unknowns")
+    at_equal_digits(small, table, IDAS, lambda o: o.steady)
     print(f"\nSteady time relative to IDAS (the faster variant) at equal tolerance, up to {SMALL} unknowns")
-    for problem in problems:
-        rivals = [table[problem.name, n] for n in ("idas", "idas-full") if (problem.name, n) in table]
-        if not rivals or len(problem.index_one().y0) > SMALL:
+    for problem in small:
+        rivals = [table[problem.name, n] for n in IDAS if (problem.name, n) in table]
+        if not rivals:
             continue
         for name in OURS:
             mine = table.get((problem.name, name), {})

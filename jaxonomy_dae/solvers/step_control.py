@@ -7,11 +7,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jax import Array
 
 from ..adjoint.ends import End
 from ..aliases import Args, Numeric, State, Time, Tolerance
+from ..lowering.gather import SCALARS, entries
 
 SAFETY = 0.9  # of the step that would just meet the tolerance (Hairer, Nørsett & Wanner 1993, II.4)
 # In tolerances: the first step is chosen as if everything moved by as much in the problem's own time. Motion below the
@@ -47,6 +47,17 @@ def tolerance_like(atol: Tolerance, y: State) -> Tolerance:
     return jax.tree.map(lambda _: atol, y)
 
 
+def rms_norm(tree: State) -> Array:
+    """The root mean square of all entries of a tree, not differentiated."""
+    leaves = [jnp.ravel(jax.lax.stop_gradient(leaf)) for leaf in jax.tree.leaves(tree)]
+    count = sum(leaf.size for leaf in leaves)
+    squares = [jnp.real(v * jnp.conj(v)) for leaf in leaves for v in (entries(leaf) if count <= SCALARS else [leaf])]
+    # Entry by entry where there are few: a sum over a short last axis, of each member of a batch, took a tenth of the
+    # time of 10,000 rollouts of a pendulum.
+    total = sum(squares) if count <= SCALARS else sum(jnp.sum(square) for square in squares)
+    return jnp.sqrt(total / max(count, 1))
+
+
 class Beside(Protocol):
     """What has errors beside the states: see `StepControl`."""
 
@@ -79,7 +90,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
 
     rtol: Tolerance
     atol: Tolerance
-    norm: Callable[[Numeric], Numeric] = optx.rms_norm
+    norm: Callable[[State], Numeric] = rms_norm
     steered: bool = eqx.field(static=True, default=False)
     dtmax: Time = None
     beside: Beside | None = None
@@ -146,7 +157,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         if self.steered:
             factor = jnp.where(jnp.isfinite(norm), decoded(norm), 0.25)
         else:
-            factor = SAFETY * norm ** (-1 / error_order)
+            factor = SAFETY * jnp.exp(jnp.log(norm) * (-1 / error_order))  # a power is not vectorized in batches
             most = jnp.where(rejected, 1.0, 8.0)  # no growth at once after a rejection
             factor = jnp.clip(factor, 0.2, jnp.where(keep, most, SAFETY))
         dt = (t1 - t0) * factor.astype(t1.dtype)

@@ -18,6 +18,7 @@ from jax import Array
 from ..aliases import Args, Time
 from ..errors import ModelError
 from ..linear.arrays import Numbers
+from ..linear.once import stacked_in_batches
 from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve
@@ -79,7 +80,7 @@ class SystemAt:
         of an array that is made of arrays, and computes its entries one by one."""
         if all(isinstance(chunk, tuple) for chunk in chunks):
             values = [value for chunk in chunks for value in chunk]
-            return jnp.stack(values) if values else jnp.zeros(0, self.dtype)
+            return stacked_in_batches(values) if values else jnp.zeros(0, self.dtype)
         return jnp.concatenate([self._array(chunk) if isinstance(chunk, tuple) else chunk for chunk in chunks])
 
     # --- vector field ------------------------------------------------------------------------------------------
