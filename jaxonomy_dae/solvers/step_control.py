@@ -11,7 +11,6 @@ from jax import Array
 
 from ..adjoint.ends import End
 from ..aliases import Args, Numeric, State, Time, Tolerance
-from ..lowering.gather import SCALARS, entries
 
 SAFETY = 0.9  # of the step that would just meet the tolerance (Hairer, Nørsett & Wanner 1993, II.4)
 # In tolerances: the first step is chosen as if everything moved by as much in the problem's own time. Motion below the
@@ -22,6 +21,9 @@ SHORT = 1e4
 # Rejections with no step of ordinary length between them. A jump of 1e6 tolerances inside a step takes 20 of them; at a
 # turning point, beyond which there is no solution, steps of a few spacings are accepted and rejected in turn.
 MOST_TRIES = 100
+# Up to so many errors are squared and added one by one: a sum over a short last axis, of each member of a batch, took a
+# tenth of the time of 10,000 rollouts of a pendulum. As many states are traced as scalars (`lowering.gather.SCALARS`).
+FEW = 32
 # A solver that chooses its own step sizes writes them into its error estimate, whose norm e a controller reads back:
 # e = SAFETY/φ for a growth or a rejection by the factor φ (what the ordinary formula for order 1 makes of it too), and
 # e = SAFETY + (1 − SAFETY)·φ for a step that is kept though the next shall be smaller.
@@ -51,11 +53,8 @@ def rms_norm(tree: State) -> Array:
     """The root mean square of all entries of a tree, not differentiated."""
     leaves = [jnp.ravel(jax.lax.stop_gradient(leaf)) for leaf in jax.tree.leaves(tree)]
     count = sum(leaf.size for leaf in leaves)
-    squares = [jnp.real(v * jnp.conj(v)) for leaf in leaves for v in (entries(leaf) if count <= SCALARS else [leaf])]
-    # Entry by entry where there are few: a sum over a short last axis, of each member of a batch, took a tenth of the
-    # time of 10,000 rollouts of a pendulum.
-    total = sum(squares) if count <= SCALARS else sum(jnp.sum(square) for square in squares)
-    return jnp.sqrt(total / max(count, 1))
+    parts = [leaf[k] for leaf in leaves for k in range(leaf.size)] if count <= FEW else leaves
+    return jnp.sqrt(sum(jnp.sum(jnp.real(v * jnp.conj(v))) for v in parts) / max(count, 1))
 
 
 class Beside(Protocol):
