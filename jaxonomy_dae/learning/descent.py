@@ -230,7 +230,7 @@ def descend(
     if found is None:
         return None
     here = _Here.of(merit, z, found, merit.weights(z, found), bounds, reweigh)
-    damping, history, count, idle = FIRST, [], 1, 0
+    damping, history, count, idle, tightened = FIRST, [], 1, 0, np.inf
     reason = f"stopped after {steps} steps, not yet converged; steps= allows more"
     for k in range(steps + 1):
         history.append(here.cost)
@@ -258,6 +258,8 @@ def descend(
             here, damping, idle = _there(merit, along, bounds, reweigh), FIRST, 0
             continue
         finer, tried = _finer(merit, here, least)
+        if finer is None and here.cost < tightened - least and max(here.open(merit)) > CLOSE:
+            finer, tightened = merit.finer(0.1), here.cost  # noise that jumps between steps is not seen so close
         count += tried
         found = None if finer is None else finer.evaluate(here.z)
         if finer is not None and found is not None:
