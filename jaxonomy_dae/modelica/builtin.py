@@ -140,21 +140,10 @@ def _boolean_as_integer(value: Value) -> Value:
     return as_number(value) if is_condition(value) else value
 
 
+ALIKE = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt".split()  # in Modelica, Python and SymPy
 FUNCTIONS: dict[str, Callable[..., Value]] = {
-    "sin": of_numbers(math.sin, sympy.sin),
-    "cos": of_numbers(math.cos, sympy.cos),
-    "tan": of_numbers(math.tan, sympy.tan),
-    "asin": of_numbers(math.asin, sympy.asin),
-    "acos": of_numbers(math.acos, sympy.acos),
-    "atan": of_numbers(math.atan, sympy.atan),
-    "atan2": of_numbers(math.atan2, sympy.atan2),
-    "sinh": of_numbers(math.sinh, sympy.sinh),
-    "cosh": of_numbers(math.cosh, sympy.cosh),
-    "tanh": of_numbers(math.tanh, sympy.tanh),
-    "exp": of_numbers(math.exp, sympy.exp),
-    "log": of_numbers(math.log, sympy.log),
+    **{name: of_numbers(getattr(math, name), getattr(sympy, name)) for name in ALIKE},
     "log10": of_numbers(math.log10, lambda x: sympy.log(x) / math.log(10.0)),
-    "sqrt": of_numbers(math.sqrt, sympy.sqrt),
     "abs": of_numbers(lambda x: x if x >= 0 else -x, lambda x: smooth(sympy.Abs(x))),
     "sign": of_numbers(_sign, lambda x: smooth(sympy.sign(x))),
     "floor": of_numbers(math.floor, sympy.floor),

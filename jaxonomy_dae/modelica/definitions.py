@@ -29,7 +29,7 @@ class DiscreteDefinitions:
     - `algorithms`, `assigned`: the other algorithms, and the names that each assigns.
     """
 
-    of: dict[str, Any]
+    of: dict[str, tree.Expression | int]
     stored: set[str]
     followed: list[str]
     equations: list[tree.Statement]
@@ -41,13 +41,13 @@ class DiscreteDefinitions:
 
 def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> DiscreteDefinitions:
     """Splits the statements of a model."""
-    found = [s for s in model.equations if isinstance(s, tree.Branches) and s.kind == "when"]
+    found = list(_whens_in(model.equations))
     whens = _merged(found)
     others = _with_choices((s for s in model.equations if s not in found) if found else model.equations, is_discrete)
     algorithms = []
     for section in model.algorithms:
-        inside = [s for s in section if isinstance(s, tree.Branches) and s.kind == "when"]
-        rest = tuple(s for s in section if not (isinstance(s, tree.Branches) and s.kind == "when"))
+        inside = list(_whens_in(section))
+        rest = tuple(s for s in section if s not in inside)
         whens += inside
         if any(not isinstance(s, tree.Effect) for s in rest):
             algorithms.append(rest)
@@ -59,8 +59,8 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
     ]
     candidates = [(s, _definable(s, is_discrete, by_when)) for s in [*others, *bindings]]
     equations: list[tree.Statement] = [s for s, sides in candidates if not sides]
-    of: dict[str, Any]
-    of, left = _matched([(s, sides) for s, sides in candidates if sides], is_discrete)
+    matched, left = _matched([(s, sides) for s, sides in candidates if sides], is_discrete)
+    of: dict[str, tree.Expression | int] = {**matched}
     equations += left
     assigned = []
     for k, section in enumerate(algorithms):
@@ -77,6 +77,10 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
         of=of, stored=by_when | set(followed), followed=followed, equations=equations, whens=whens,
         initial=list(model.initial_equations), algorithms=algorithms, assigned=assigned,
     )  # fmt: skip
+
+
+def _whens_in(statements: Iterable[tree.Statement]) -> Iterator[tree.Branches]:
+    return (s for s in statements if isinstance(s, tree.Branches) and s.kind == "when")
 
 
 def _merged(whens: list[tree.Branches]) -> list[tree.Branches]:

@@ -78,8 +78,7 @@ def _write_mode(scope: Scope, name: str) -> None:
 
 
 def _write_together(scope: Scope, names: list[str]) -> None:
-    """Adds the events of modes that change at once: each gets the value that its equation has before. Two events in
-    turn, for an event happens where its condition becomes true, and modes may have to change again."""
+    """Adds the events of modes that change at once: each gets the value that its equation has before."""
     pending: Value = False
     actions = []
     for name in names:
@@ -94,10 +93,16 @@ def _write_together(scope: Scope, names: list[str]) -> None:
     if isinstance(pending, bool):
         return
     scope.pending.append(pending)
-    turn = _hidden(scope, ":turn", 0)
+    _in_turn(scope, ":turn", pending, actions, EventFlag.AT_START)
+
+
+def _in_turn(scope: Scope, name: str, pending: Value, actions: list[Action], flags: EventFlag) -> None:
+    """Adds two events in turn: an event happens where its condition becomes true, and these may have to happen
+    again."""
+    turn = _hidden(scope, name, 0)
     for now in (0, 1):
         condition = scope.kept.in_events(both(pending, plain(sympy.Eq(turn, now))))
-        scope.component._event(condition, (*actions, assign(turn, 1 - now)), None, EventFlag.AT_START)
+        scope.component._event(condition, (*actions, assign(turn, 1 - now)), None, flags)
 
 
 def _hidden(scope: Scope, name: str, start: float) -> DiscreteSymbol:
@@ -244,10 +249,7 @@ def _write_chain(scope: Scope, chain: list[tuple[list[Rise], tuple[tree.Statemen
             else:
                 cases.setdefault(target, []).append((before(kept(here, alone=False)), value))
     actions = [_action(target, _first(target, found)) for target, found in cases.items()]
-    turn = _hidden(scope, f":turn[{len(scope.component.parameters)}]", 0)
-    for now in (0, 1):
-        condition = kept(both(risen, plain(sympy.Eq(turn, now))))
-        scope.component._event(condition, (*actions, assign(turn, 1 - now)), None, EventFlag.LISTED)
+    _in_turn(scope, f":turn[{len(scope.component.parameters)}]", risen, actions, EventFlag.LISTED)
 
 
 def _before_tick(scope: Scope, parts: list[tree.Expression]) -> list[Value]:
@@ -356,10 +358,7 @@ def _chosen_actions(scope: Scope, s: tree.Branches) -> Iterator[tuple[Target, Va
         if otherwise is False:
             break
     for target, cases in found.items():
-        value: Value = pre(target)
-        for condition, result in reversed(cases):
-            value = chosen(condition, result, value)
-        yield target, value
+        yield target, _first(target, cases)
 
 
 def _conjuncts(e: tree.Expression) -> list[tree.Expression]:

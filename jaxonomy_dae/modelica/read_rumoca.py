@@ -12,7 +12,7 @@ from typing import Any
 from ..errors import ModelError
 from . import tree
 from .flat_model import FlatModel
-from .rumoca_expressions import PREFIX, SCALAR, VARIABLE, Json, Places, RumocaExpressions, flat_class
+from .rumoca_expressions import PREFIX, SCALAR, VARIABLE, Json, Places, RumocaExpressions
 
 SCHEMA = 43  # of the dictionary; rumoca changes it between its versions, and says nothing of the changes
 VERSION = "0.10.2"  # of rumoca, which writes that schema
@@ -51,14 +51,14 @@ class _Reader:
         for each in (*s["previous_values"], *(c for c in s["clock_ownerships"] if c.get("sampled"))):
             self.of.refuse("a synchronous clock", each.get("provenance"))
         equations = [e for op in s["continuous_equation_operations"] for e in self._equations(op)]
-        equations += self._always()
+        equations += [e for activation, _, _, e in self._of_discrete() if activation == "always"]
         equations += self._whens()
         initial = [e for op in s["initialization_equation_operations"] for e in self._equations(op)]
         for each in (*s["initial_discrete_values"], *s["initial_parameter_values"]):
             line = self.of.line(each.get("provenance"))
             initial.append(tree.Equality(self.of.variable(each["target"]), self.of.expression(each["value"], {}), line))
         declarations = [d for v in self.of.variables for d in self._declarations(v)]
-        model = flat_class("model", self.of.name, declarations, equations=equations, initial=initial)
+        model = tree.Class("model", self.of.name, tuple(declarations), tuple(equations), tuple(initial))
         return FlatModel(model, {c.name: c for c in self.of.classes()})
 
     # --- declarations ------------------------------------------------------------------------------------------------
@@ -134,17 +134,18 @@ class _Reader:
             return tree.Equality(e.left, e.right, line)
         return tree.Equality(e, tree.Number(0.0), line)
 
-    def _always(self) -> Iterator[tree.Statement]:
-        """Equations of discrete variables that hold at all times."""
+    def _of_discrete(self) -> Iterator[tuple[Any, str, Json | None, tree.Equality]]:
+        """(activation, variable, where it stands, equation) of all equations of discrete variables."""
         for owner in self.of.storage["discrete_value_owners"]:
             for branch in owner["branches"]:
-                if branch["activation"] == "always":
-                    for target, value in zip(owner["targets"], branch["values"], strict=True):
-                        line = self.of.line(branch.get("provenance") or owner.get("provenance"))
-                        yield tree.Equality(self.of.variable(target), self.of.expression(value["value"], {}), line)
+                where = branch.get("provenance") or owner.get("provenance")
+                for target, value in zip(owner["targets"], branch["values"], strict=True):
+                    left, right = self.of.variable(target), self.of.expression(value["value"], {})
+                    yield branch["activation"], left.path, where, tree.Equality(left, right, self.of.line(where))
         for each in self.of.storage["discrete_real_equations"]:
-            if each["activation"] == "always":
-                yield self._equality(each["residual"], {}, self.of.line(each.get("provenance")))
+            where = each.get("provenance")
+            e = self._equality(each["residual"], {}, self.of.line(where))
+            yield each["activation"], e.left.path if isinstance(e.left, tree.Reference) else "", where, e
 
     # --- events ------------------------------------------------------------------------------------------------------
 
@@ -169,32 +170,17 @@ class _Reader:
     def _actions(self) -> Iterator[tuple[Any, int, int, tree.Statement]]:
         """(what is acted on, trigger, guard, statement) of all actions at events, in order."""
         s = self.of.storage
-        in_steps: set[int] = set()
+        in_steps: set[str] = set()
         for transaction in s["model_event_transactions"]:  # of a `when` in an algorithm
-            in_steps |= {t["variable"] for t in transaction["targets"]}
+            in_steps |= {self.of.variables[t["variable"]]["name"] for t in transaction["targets"]}
             for step in transaction["steps"]:
                 for d in step["definitions"]:
                     line = self.of.line(d.get("provenance") or step.get("provenance") or transaction.get("provenance"))
-                    value = tree.Assignment(
-                        self.of.variable(d["target"]["variable"]), self.of.expression(d["value"], {}), line
-                    )
-                    yield d["target"]["variable"], step["trigger"], step["guard"], value
-        for owner in s["discrete_value_owners"]:
-            for branch in owner["branches"]:
-                if branch["activation"] != "always":
-                    when = self._when(branch["activation"], branch.get("provenance") or owner.get("provenance"))
-                    for target, value in zip(owner["targets"], branch["values"], strict=True):
-                        if target not in in_steps:
-                            line = self.of.line(branch.get("provenance") or owner.get("provenance"))
-                            e = tree.Equality(self.of.variable(target), self.of.expression(value["value"], {}), line)
-                            yield target, *when, e
-        for each in s["discrete_real_equations"]:
-            if each["activation"] != "always":
-                when = self._when(each["activation"], each.get("provenance"))
-                e = self._equality(each["residual"], {}, self.of.line(each.get("provenance")))
-                target = e.left.path if isinstance(e.left, tree.Reference) else ""
-                if not any(self.of.variables[t]["name"] == target for t in in_steps):
-                    yield target, *when, e
+                    target, value = self.of.variable(d["target"]["variable"]), self.of.expression(d["value"], {})
+                    yield target.path, step["trigger"], step["guard"], tree.Assignment(target, value, line)
+        for activation, target, where, e in self._of_discrete():
+            if activation != "always" and target not in in_steps:
+                yield target, *self._when(activation, where), e
         for action in s["event_actions"]:
             kind, inside = next(iter(action["kind"].items()))
             line = self.of.line(action.get("provenance"))

@@ -5,7 +5,7 @@ Expressions are numbered; their operands and subscripts stand in lists of their 
 
 import bisect
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 from ..errors import ModelError
@@ -67,7 +67,7 @@ class RumocaExpressions:
     def _record(self, of: Json) -> tree.Class:
         fields = [(f["name"], self.types[f["value_type"]]) for f in of["record_fields"]]
         declared = [_declared(frozenset(), n, t) for n, t in fields]
-        return flat_class("record", of["record_name"], declared)
+        return tree.Class("record", of["record_name"], tuple(declared))
 
     def binders(self, domain: int) -> list[tuple[tuple[int, int], range]]:
         """The binders of a domain and of those around it, with their values."""
@@ -276,9 +276,8 @@ class RumocaExpressions:
         for prefix, values in (("output", outputs), ("protected", f["locals"])):
             declared += [_declared(frozenset({prefix}), v["name"], self.types[v["value_type"]]) for v in values]
         external = None if f.get("external") is None else str(f["external"].get("name") or f["name"])
-        return flat_class(
-            "function", self._function_name(function, output), declared, algorithm=body, external=external
-        )
+        name, algorithms = self._function_name(function, output), (tuple(body),) if body else ()
+        return tree.Class("function", name, tuple(declared), algorithms=algorithms, external=external)
 
     def _statement(self, function: int, statement: Json) -> Iterator[tree.Statement]:
         kind, inside = next(iter(statement.items()))
@@ -337,16 +336,6 @@ class _Lines:
             text = self.texts[source].encode()
             self.ends[source] = [i for i, c in enumerate(text) if c == 10]
         return bisect.bisect_left(self.ends[source], span["start"]) + 1
-
-
-def flat_class(
-    kind: str, name: str, declarations: Iterable[tree.Declaration], equations: Iterable[tree.Statement] = (),
-    initial: Iterable[tree.Statement] = (), algorithm: Sequence[tree.Statement] = (), external: str | None = None,
-) -> tree.Class:  # fmt: skip
-    return tree.Class(
-        kind, name, tuple(declarations), tuple(equations), tuple(initial), (tuple(algorithm),) if algorithm else (),
-        external=external,
-    )  # fmt: skip
 
 
 def _declared(prefixes: frozenset[str], name: str, of: Json) -> tree.Declaration:

@@ -74,7 +74,9 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
             if isinstance(b, sympy.Basic) and any(isinstance(s, VariableSymbol) for s in b.free_symbols):
                 c.when(scope.at_start(), assign(a, b), at_start=True)
             else:
-                c.parameters[a.path] = c.parameters[a.path].with_value(_plain(b) if known else _number(scope, b))
+                c.parameters[a.path] = c.parameters[a.path].with_value(
+                    _plain(b) if known else float(_numerical(scope, b))
+                )
             return
         if isinstance(a, VariableSymbol) and known:
             if a.order:
@@ -91,11 +93,6 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     a, b = (float(_numerical(scope, sympy.sympify(side))) for side in (left, right))
     if not math.isclose(a, b):  # a text has up to sixteen digits
         raise ModelError(f"the initial equation {left} = {right} does not hold for the declared starts")
-
-
-def _number(scope: Scope, value: Value) -> float:
-    """The start of a discrete variable that depends on time, or on the starts of others."""
-    return float(_numerical(scope, value))
 
 
 def _numerical(scope: Scope, value: Value) -> Value:
