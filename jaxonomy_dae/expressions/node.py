@@ -11,7 +11,8 @@ import math
 import weakref
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from fractions import Fraction
-from typing import Any
+from operator import attrgetter
+from typing import Any, TypeVar
 
 Number = int | Fraction | float
 
@@ -31,7 +32,7 @@ class Node:
     leaves: frozenset
 
     def __reduce__(self):
-        order = postorder([self])
+        order: list[Node] = postorder([self])
         place = {n: k for k, n in enumerate(order)}
         rows = tuple((n.operation, tuple(place[a] for a in n.arguments), n.data) for n in order)
         return _restored, (rows,)
@@ -268,13 +269,16 @@ def compare(operation: str, a: Node, b: Node) -> Node:
     return make(operation, (a, b))
 
 
-def postorder(roots: Iterable[Node], before: Callable[[Node], Iterable[Node]] = lambda n: n.arguments) -> list[Node]:
+N = TypeVar("N", bound=Hashable)
+
+
+def postorder(roots: Iterable[N], before: Callable[[N], Iterable[N]] = attrgetter("arguments")) -> list[N]:
     """All nodes reachable from the roots, each once, after the nodes that `before` returns for it (by default its
     arguments)."""
-    seen: set[Node] = set()
-    out: list[Node] = []
+    seen: set[N] = set()
+    out: list[N] = []
     for root in roots:
-        stack: list[tuple[Node, bool]] = [(root, False)]
+        stack: list[tuple[N, bool]] = [(root, False)]
         while stack:
             node, finished = stack.pop()
             if finished:

@@ -16,6 +16,7 @@ from ..aliases import Condition, Expression
 from ..errors import ModelError
 from ..expressions.branches import ALWAYS, NEVER, Needed, union, within
 from ..expressions.from_sympy import UnsupportedExpression, parts_of, symbols_of
+from ..expressions.node import postorder
 from ..expressions.smooth import Smooth
 from .events import LIVE, has_guard
 from .symbols import RelationSymbol, TimeSymbol, VariableSymbol
@@ -47,52 +48,32 @@ def smooth(expression: object) -> Expression:
 
 @dataclasses.dataclass(frozen=True)
 class Turning:
-    """A condition whose truth becomes the hidden discrete variable `number`: 1, 0, or LIVE (decided by its sides). It
-    turns while `watched` holds, and is a `kink` if both branches have the same value where it turns."""
+    """A condition whose truth becomes the hidden discrete variable `number`: 1, 0, or LIVE (decided by its sides).
+
+    It turns at times that are known beforehand, `when` is then their `Edges`; or while a condition holds, `when`. It is
+    a `kink` if both branches have the same value where it turns.
+    """
 
     number: int
     condition: Condition
-    watched: Condition
+    when: Condition | Edges
     kink: bool = False
-    starts: ClassVar = (float(LIVE),)
+    starts: ClassVar = (float(LIVE),)  # of the hidden discrete variables
 
 
 @dataclasses.dataclass(frozen=True)
 class Stepping:
     """The whole part of an argument as a hidden discrete variable: `number` is LIVE until an event has set variable
-    `number` + 1 to the whole part. It changes while `watched` holds."""
+    `number` + 1 to the whole part. It changes at times that are known beforehand, or while a condition holds: `when`,
+    as that of `Turning`."""
 
     number: int
     argument: Expression
-    watched: Condition
+    when: Condition | Edges
     starts: ClassVar = (float(LIVE), 0.0)
 
 
-@dataclasses.dataclass(frozen=True)
-class Timed:
-    """A relation that turns at times known beforehand; its truth is the hidden discrete variable `number`. It is a
-    `kink` if both branches have the same value where it turns."""
-
-    number: int
-    condition: Condition
-    edges: Edges
-    kink: bool = False
-    starts: ClassVar = (float(LIVE),)
-
-
-@dataclasses.dataclass(frozen=True)
-class TimedSteps:
-    """The whole part of an argument that changes at times known beforehand; its variables are numbered as those of
-    `Stepping`."""
-
-    number: int
-    argument: Expression
-    edges: Edges
-    starts: ClassVar = (float(LIVE), 0.0)
-
-
-# Each `starts` its hidden discrete variables at these values.
-Watched = Turning | Stepping | Timed | TimedSteps
+Watched = Turning | Stepping
 
 
 class Splitting:
@@ -101,7 +82,7 @@ class Splitting:
 
     def __init__(self, first: int):
         self.next = first
-        self.timed: dict[Condition, Timed] = {}
+        self.timed: dict[Condition, Turning] = {}
 
     def split(self, condition: Condition) -> tuple[Condition, Condition]:
         """Returns (the condition for equations, the condition for guards), with relations that turn at known times
@@ -119,7 +100,7 @@ class Splitting:
             edges = edges_of(relation)
             if edges is None:
                 return False
-            self.timed[relation] = Timed(self.next, relation, edges)
+            self.timed[relation] = Turning(self.next, relation, edges)
             self.next += 1
         return True
 
@@ -177,7 +158,7 @@ class _Rewriting:
         self.needed = _needed_where([r for r in residuals if r in inside], order)
         self.new: dict[Expression, Expression] = {}
         self.old: dict[Expression, Expression] = {}  # the other way round
-        self.timed_steps: list[TimedSteps] = []
+        self.timed_steps: list[Stepping] = []
         self.conditions: dict[Condition, Condition] = {}
         # (kind, number, condition or argument, the expressions that it stands in)
         self.found: list[tuple[type, int, Expression, list[Expression]]] = []
@@ -293,7 +274,7 @@ class _Rewriting:
         if edges is None:
             self.found.append((Stepping, number, argument, [e]))
         else:
-            self.timed_steps.append(TimedSteps(number, argument, edges))
+            self.timed_steps.append(Stepping(number, argument, edges))
         unknown: Condition = sympy.Eq(live, LIVE)
         return sympy.Piecewise((sympy.floor(argument), unknown), (whole, True), evaluate=False)
 
@@ -453,18 +434,7 @@ def _is_hidden(residual: sympy.Expr) -> bool:
 
 def _inside_out(roots: Sequence[Expression]) -> list[Expression]:
     """The parts of expressions, each once, inner ones first. Parts marked as smooth are left out."""
-    seen: set[Expression] = set()
-    out: list[Expression] = []
-    stack = [(e, False) for e in reversed(roots)]
-    while stack:
-        e, finished = stack.pop()
-        if finished:
-            out.append(e)
-        elif e not in seen:
-            seen.add(e)
-            stack.append((e, True))
-            stack.extend((a, False) for a in reversed(_arguments(e)) if a not in seen)
-    return out
+    return postorder(roots, lambda e: reversed(_arguments(e)))
 
 
 def _untyped(e: Expression) -> tuple[Expression, ...]:

@@ -1,17 +1,15 @@
 """Relations in a component's equations whose changes are events: declared, or found when the component is complete."""
 
-from collections.abc import Callable
-from typing import Any
-
 import sympy
 from sympy.logic.boolalg import BooleanAtom
 
 from ..aliases import Condition, Expression
 from ..expressions.to_sympy import shortened
-from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, jumps, turned, varies, with_events
+from .automatic_events import Splitting, Stepping, Turning, jumps, turned, varies, with_events
 from .event_declarations import EventDeclarations
 from .events import LIVE, NO_FLAG, Assign, EventFlag, Sampled, is_strict
 from .symbols import PreviousSymbol, RelationSymbol, VariableSymbol
+from .timed_relations import Edges
 
 _ORDERED = (sympy.StrictLessThan, sympy.LessThan, sympy.StrictGreaterThan, sympy.GreaterThan)
 
@@ -48,7 +46,7 @@ class RelationDeclarations(EventDeclarations):
         live, guarded = numbers.split(condition)
         for each in numbers.timed.values():
             self.relations.extend(each.starts)
-            self._ticks(each)
+            self._turns(each)
         if numbers.timed and not varies(guarded):
             return live, guarded
         known: Condition = self._hidden_discrete(float(LIVE))
@@ -97,41 +95,41 @@ class RelationDeclarations(EventDeclarations):
         for each in watched:
             self.relations.extend(each.starts)
         for each in watched:
-            _DECLARED[type(each)](self, each)
+            if isinstance(each, Turning):
+                self._turns(each)
+            else:
+                self._steps(each)
 
     def _turns(self, relation: Turning) -> None:
-        known, condition = RelationSymbol(relation.number), relation.condition
+        """Events of a relation. At the initial time it is as its sides say, unless a clock ticks there."""
+        known, condition, edges = RelationSymbol(relation.number), relation.condition, relation.when
+        if isinstance(edges, Edges):
+            unknown: Condition = sympy.Eq(PreviousSymbol(known.path), LIVE)
+            as_it_is = sympy.Piecewise((1, condition), (0, True))
+            for clock, after in edges.clocks:
+                value = _unless(sympy.Or(unknown, sympy.Not(edges.turns)), as_it_is, after)
+                self._relation_event(clock, shortened(condition), Assign(known, value), kink=relation.kink)
+            return
         for holds, value in ((condition, 1), (sympy.Not(condition), 0)):
             action = Assign(known, sympy.Integer(value))
-            self._relation_event(holds, shortened(condition), action, watched=relation.watched, kink=relation.kink)
-
-    def _ticks(self, relation: Timed) -> None:
-        """Clocks of a relation of time. At the initial time it is as its sides say, unless a clock ticks there."""
-        known, condition, edges = RelationSymbol(relation.number), relation.condition, relation.edges
-        unknown: Condition = sympy.Eq(PreviousSymbol(known.path), LIVE)
-        as_it_is = sympy.Piecewise((1, condition), (0, True))
-        for clock, after in edges.clocks:
-            value = _unless(sympy.Or(unknown, sympy.Not(edges.turns)), as_it_is, after)
-            self._relation_event(clock, shortened(condition), Assign(known, value), kink=relation.kink)
-
-    def _ticks_of_steps(self, whole: TimedSteps) -> None:
-        """Clocks of a whole part of time, which is halfway to the next number from the one that it has at a tick."""
-        live, known = RelationSymbol(whole.number), RelationSymbol(whole.number + 1)
-        unknown: Condition = sympy.Eq(PreviousSymbol(live.path), LIVE)
-        now = sympy.floor(whole.argument)
-        for clock, rises in whole.edges.clocks:
-            after = sympy.floor(whole.argument + rises - sympy.Rational(1, 2))
-            value = _unless(sympy.Or(unknown, sympy.Not(whole.edges.turns)), now, after)
-            self._relation_event(clock, shortened(now), Assign(live, sympy.Integer(0)), Assign(known, value))
+            self._relation_event(holds, shortened(condition), action, watched=edges, kink=relation.kink)
 
     def _steps(self, whole: Stepping) -> None:
-        """Events of a whole part. One may leave more than one number behind at an instant, where the argument jumps."""
+        """Events of a whole part. Of time, it is halfway to the next number from the one that it has at a tick. Other
+        events may leave more than one number behind at an instant, where the argument jumps."""
         live, known = RelationSymbol(whole.number), RelationSymbol(whole.number + 1)
-        before, now = PreviousSymbol(known.path), sympy.floor(whole.argument)
-        unknown: Condition = sympy.Eq(live, LIVE)
+        now, watched = sympy.floor(whole.argument), whole.when
+        text, decided = shortened(now), Assign(live, sympy.Integer(0))
+        if isinstance(watched, Edges):
+            unknown: Condition = sympy.Eq(PreviousSymbol(live.path), LIVE)
+            for clock, rises in watched.clocks:
+                after = sympy.floor(whole.argument + rises - sympy.Rational(1, 2))
+                value = _unless(sympy.Or(unknown, sympy.Not(watched.turns)), now, after)
+                self._relation_event(clock, text, decided, Assign(known, value))
+            return
+        before = PreviousSymbol(known.path)
         found: Condition = sympy.Ne(live, LIVE)
-        text, watched = shortened(now), whole.watched
-        self._relation_event(unknown, text, Assign(live, sympy.Integer(0)), Assign(known, now), watched=watched)
+        self._relation_event(sympy.Eq(live, LIVE), text, decided, Assign(known, now), watched=watched)
         for condition, value in (
             (sympy.Ge(whole.argument, known + 1, evaluate=False), sympy.Max(before + 1, now)),
             (sympy.Lt(whole.argument, known, evaluate=False), sympy.Min(before - 1, now)),
@@ -149,11 +147,3 @@ class RelationDeclarations(EventDeclarations):
 
 def _unless(condition: Condition, otherwise: Expression, value: Expression) -> Expression:
     return sympy.Piecewise((otherwise, condition), (value, True), evaluate=False)
-
-
-_DECLARED: dict[type, Callable[[Any, Any], None]] = {
-    Turning: RelationDeclarations._turns,
-    Stepping: RelationDeclarations._steps,
-    Timed: RelationDeclarations._ticks,
-    TimedSteps: RelationDeclarations._ticks_of_steps,
-}
