@@ -157,7 +157,7 @@ def test_names_order_nothing():
     assert renamed_back(str(renamed.report)) == str(expected.report)
     assert [renamed_back(n) for n in renamed.states] == expected.states
     assert [renamed_back(n) for n in renamed.variables] == expected.variables
-    assert tuple(map(renamed_back, renamed.plan.quantity_name)) == expected.plan.quantity_name
+    assert [*map(renamed_back, renamed.plan.quantity_name)] == list(expected.plan.quantity_name)
 
 
 def test_equal_circuits_of_different_values_have_one_structure():
