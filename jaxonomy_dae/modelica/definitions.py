@@ -3,7 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..errors import ModelError
 from . import tree
@@ -142,7 +142,7 @@ def _definable(
 
 
 def _matched(
-    candidates: list[tuple[Any, list[tuple[str, tree.Expression]]]], is_discrete: Callable[[str], bool]
+    candidates: list[tuple[tree.Statement, list[tuple[str, tree.Expression]]]], is_discrete: Callable[[str], bool]
 ) -> tuple[dict[str, tree.Expression], list[tree.Statement]]:
     """(One equation for each variable, by augmenting paths; equations that are left, of continuous variables)."""
     owner: dict[str, int] = {}
@@ -204,7 +204,7 @@ def with_entries(names: Iterable[str], model: tree.Class) -> list[str]:
     return list(out)
 
 
-def _read_before(statement: Any) -> Iterator[str]:
+def _read_before(statement: object) -> Iterator[str]:
     """The names in pre(…), edge(…) and change(…)."""
     for e in tree.each_part(statement):
         if (

@@ -321,7 +321,7 @@ def local_names(local: Mapping[str, Value], outer: Names) -> Names:
     return names
 
 
-def _refused(_: Evaluator, e: Any, __: Names) -> NoReturn:
+def _refused(_: Evaluator, e: object, __: Names) -> NoReturn:
     raise ModelError(f"{type(e).__name__} cannot stand in an expression")
 
 

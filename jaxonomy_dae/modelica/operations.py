@@ -1,7 +1,6 @@
 """Modelica's operators on numbers, truths, texts and expressions."""
 
 from collections.abc import Callable
-from typing import Any
 
 import sympy
 
@@ -29,7 +28,7 @@ def _plain_number(value: Value) -> Value:
     return float(value) if isinstance(value, sympy.Number) else value
 
 
-def _relation(number: Callable[[Any, Any], bool], symbol: Any) -> Callable[[Value, Value], Value]:
+def _relation(number: Callable[[Value, Value], bool], symbol: Callable[..., Value]) -> Callable[[Value, Value], Value]:
     def relation(a: Value, b: Value) -> Value:
         a, b = as_number(a), as_number(b)
         if isinstance(a, int | float | str) and isinstance(b, int | float | str):
@@ -44,7 +43,7 @@ def _relation(number: Callable[[Any, Any], bool], symbol: Any) -> Callable[[Valu
 
 def moves(choice: sympy.Piecewise) -> bool:
     """True if a branch changes between events."""
-    branches: tuple[Any, ...] = choice.args
+    branches: tuple[Value, ...] = choice.args
     return any(
         moves(value) if isinstance(value, sympy.Piecewise) else bool(value.atoms(VariableSymbol))
         for value, _ in branches

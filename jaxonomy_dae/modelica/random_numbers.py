@@ -9,7 +9,7 @@ States that are known while a model is read are integers of Python, others are a
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +21,7 @@ from ..modeling.component import Component
 from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 from .values import Results, Value
 
-Word = Any  # an int below 2^64, or an array of the type uint64
+Word: TypeAlias = Numeric  # an int below 2^64, or an array of the type uint64
 BITS = (1 << 64) - 1
 ROUNDS = 10  # that hide a poor seed
 NO_SEED = 126247697  # in place of two seeds that are zero, of which xorshift makes zeros for ever

@@ -7,13 +7,14 @@ events. Here it becomes the record that `read_base` makes of a text.
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 from ..errors import ModelError
 from . import tree
 from .flat_model import FlatModel
 from .rumoca_expressions import PREFIX, SCALAR, VARIABLE, Json, Places, RumocaExpressions
 
+Target: TypeAlias = str | tuple[str, int]  # what an action acts on: a variable, a state set anew, the end of the run
 SCHEMA = 43  # of the dictionary; rumoca changes it between its versions, and says nothing of the changes
 VERSION = "0.10.2"  # of rumoca, which writes that schema
 _PREFERENCE = {"Never": "never", "Avoid": "avoid", "Default": "default", "Prefer": "prefer", "Always": "always"}
@@ -152,8 +153,8 @@ class _Reader:
     def _whens(self) -> list[tree.Branches]:
         """The actions at events, those of one trigger together. Triggers that act on one variable are branches of one
         `when` in their order: Modelica allows one `when` for each variable."""
-        bodies: dict[int, list[tuple[Any, tree.Expression | None, tree.Statement]]] = {}
-        targets: dict[Any, list[int]] = {}
+        bodies: dict[int, list[tuple[Target, tree.Expression | None, tree.Statement]]] = {}
+        targets: dict[Target, list[int]] = {}
         for target, trigger, guard, statement in self._actions():
             bodies.setdefault(trigger, []).append((target, self._guard(guard, trigger), statement))
             targets.setdefault(target, []).append(trigger)
@@ -167,7 +168,7 @@ class _Reader:
             out.append(tree.Branches("when", branches, bodies[chain[0]][0][2].line))
         return out
 
-    def _actions(self) -> Iterator[tuple[Any, int, int, tree.Statement]]:
+    def _actions(self) -> Iterator[tuple[Target, int, int, tree.Statement]]:
         """(what is acted on, trigger, guard, statement) of all actions at events, in order."""
         s = self.of.storage
         in_steps: set[str] = set()
@@ -216,10 +217,10 @@ def _places(binders: Sequence[tuple[tuple[int, int], range]]) -> Iterator[Places
         yield dict(zip((key for key, _ in binders), values, strict=True))
 
 
-def _guarded(body: Sequence[tuple[Any, tree.Expression | None, tree.Statement]]) -> Iterator[tree.Statement]:
+def _guarded(body: Sequence[tuple[Target, tree.Expression | None, tree.Statement]]) -> Iterator[tree.Statement]:
     """The statements of one trigger. Those with guards stand in an `if`; later ones are its further branches where they
     act on one variable, and assignments take place one after the other."""
-    chains: dict[Any, list[tuple[tree.Expression, tuple[tree.Statement, ...]]]] = {}
+    chains: dict[Target, list[tuple[tree.Expression, tuple[tree.Statement, ...]]]] = {}
     for target, guard, statement in body:
         if guard is None:
             yield statement

@@ -111,7 +111,7 @@ def parts_of_choice(value: Value) -> list[tuple[Value, Value]]:
         return [(value, True)]
     out: list[tuple[Value, Value]] = []
     otherwise: Value = True
-    branches: tuple[Any, ...] = value.args
+    branches: tuple[Value, ...] = value.args
     for branch, condition in branches:
         here = both(otherwise, plain(condition))
         out.extend((v, both(here, c)) for v, c in parts_of_choice(branch))

@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from ..adjoint.resting import still
-from ..aliases import Inputs, Result, Time, Times
+from ..aliases import Controller, Inputs, PyTree, Result, Solver, Time, Times
 from ..errors import ModelError
 from ..initialization.initial_values import check_initial
 from ..solvers.solve_arguments import check_finite, check_longest_step
@@ -41,7 +41,7 @@ TEXT = (
 AHEAD = np.concatenate([[0.0], 10.0 ** np.linspace(-15, 0, 64)])
 
 
-def check_system(system: Any) -> None:
+def check_system(system: AcausalSystem) -> None:
     """Raises a `ModelError` for anything but one system."""
     if not isinstance(system, AcausalSystem):
         raise ModelError(f"simulate needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
@@ -53,7 +53,7 @@ def check_system(system: Any) -> None:
     _note_single_precision(system)
 
 
-def check_method(system: AcausalSystem, solver: Any, adjoint: Any, stepsize_controller: Any) -> None:
+def check_method(system: AcausalSystem, solver: Solver, adjoint: PyTree, stepsize_controller: Controller) -> None:
     """Raises a `ModelError` for a solver, an adjoint or a controller that cannot work, and says what would."""
     if solver is not None and not isinstance(solver, diffrax.AbstractSolver):
         if isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver):
@@ -91,7 +91,7 @@ def check_steps(system: AcausalSystem, ts: Times, dtmax: Time, max_steps: Any) -
     check_longest_step(dtmax)
 
 
-def check_start(system: AcausalSystem, t0: Time, t1: Time, ts: Times, initial: Any) -> None:
+def check_start(system: AcausalSystem, t0: Time, t1: Time, ts: Times, initial: PyTree) -> None:
     """Raises a `ModelError` for an interval, times and a start that cannot be."""
     if isinstance(initial, SavedState):
         check_saved_state(system, t0, initial)

@@ -1,7 +1,5 @@
 """A run that begins at a whole state, such as where another one ended."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..aliases import Args, Time
+from ..aliases import Args, PyTree, Time
 from ..errors import InitializationError, ModelError
 from ..initialization.initialize import InitialPoint, is_consistent
 from ..modeling.events import EventFlag
@@ -40,7 +38,7 @@ def from_state(system: AcausalSystem, t0: Time, inputs: Args, x: Float[Array, " 
     return given._replace(x=moved, residual=frozen(moved - near))
 
 
-def check_array(system: AcausalSystem, initial: Any) -> None:
+def check_array(system: AcausalSystem, initial: PyTree) -> None:
     """Raises a `ModelError` if an array cannot be, or does not say, the state of this system."""
     n, events = system.plan.n_state, system.plan.events
     if events is not None:

@@ -1,7 +1,7 @@
 """One run of a compiled system: a consistent start, the integration, and saved states on the constraints."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -162,7 +162,7 @@ def run(
     discrete = rows.discrete
     if discrete is not None:
         discrete = jnp.where((rows.filled & consistent)[:, None], discrete, jnp.nan)
-    end: Any = done.last[1]
+    end: HybridState = done.last[1]
     with_events = parts.problem is not None
     return Outcome(
         found=begin.found._replace(jacobian=None), ts=rows.ts, x=x, last=rows.last, stats=done.stats,
@@ -236,7 +236,7 @@ def _rows(given: Given, begin: _Start, parts: _Parts, done: Run) -> _Rows:
     discrete = memory = None
     if parts.problem is not None:
         x, discrete, marks = x
-        end: Any = last[1]
+        end: HybridState = last[1]
         memory, last = Memory.of(parts.problem, saved, marks, end.size), (last[0], end.x)
     x = jnp.asarray(x)
     filled = jnp.isfinite(saved)

@@ -49,13 +49,19 @@ class TimedSwitch(TwoPin):
         self.when(ev.t >= instant, assign(closed, int(not opens)), on=Eq(closed, int(opens)), at_start=True)
 
 
-def _knee(v: sympy.Expr, i: sympy.Expr, on: sympy.Expr, off: sympy.Expr, knee: sympy.Expr) -> tuple:
-    """Two expressions, never negative, of which one is zero: the first while the diode conducts, the second while it
-    blocks."""
-    return knee + on * (i - off * knee) - v, i - off * v
+class _Straight(TwoPin):
+    def _branches(self, Ron: Value, Goff: Value, Vknee: Value) -> tuple[sympy.Expr, sympy.Expr]:
+        """Two expressions, never negative, of which one is zero: the first while the diode conducts, the second while
+        it blocks."""
+        on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
+        off = self.parameter("Goff", Goff, unit="S", bounds=NONNEGATIVE)
+        knee = self.parameter("Vknee", Vknee, unit="V", bounds=NONNEGATIVE)
+        v, i = self._two_pins()
+        self.declare_dissipation(v * i)
+        return knee + on * (i - off * knee) - v, i - off * v
 
 
-class IdealDiode(TwoPin):
+class IdealDiode(_Straight):
     """A diode with two straight branches (Cellier & Kofman 2006, Continuous System Simulation, chapter 9).
 
     While it conducts, v = Vknee + Ron·(i − Goff·Vknee); while it blocks, i = Goff·v, with v ≤ Vknee. `Ron` in ohm,
@@ -65,29 +71,19 @@ class IdealDiode(TwoPin):
 
     def __init__(self, ev: EqnEnv, name: str, Ron: Value = 0.0, Goff: Value = 0.0, Vknee: Value = 0.0):
         super().__init__(ev, name)
-        on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
-        off = self.parameter("Goff", Goff, unit="S", bounds=NONNEGATIVE)
-        knee = self.parameter("Vknee", Vknee, unit="V", bounds=NONNEGATIVE)
-        v, i = self._two_pins()
-        self.complementary(*_knee(v, i, on, off, knee))
-        self.declare_dissipation(v * i)
+        self.complementary(*self._branches(Ron, Goff, Vknee))
 
 
-class IdealThyristor(TwoPin):
+class IdealThyristor(_Straight):
     """A diode that blocks until the input `fire` is above 0.5 while v exceeds Vknee, and conducts until the current
     has gone; parameters as of `IdealDiode`."""
 
     def __init__(self, ev: EqnEnv, name: str, Ron: Value = 0.0, Goff: Value = 0.0, Vknee: Value = 0.0):
         super().__init__(ev, name)
-        on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
-        off = self.parameter("Goff", Goff, unit="S", bounds=NONNEGATIVE)
-        knee = self.parameter("Vknee", Vknee, unit="V", bounds=NONNEGATIVE)
         fire = self.input("fire", unit="1")
+        drop, current = self._branches(Ron, Goff, Vknee)
         active = self.discrete("active", start=0, unit="1")
-        v, i = self._two_pins()
-        drop, current = _knee(v, i, on, off, knee)
         self.either(Eq(active, 1), drop, current)
-        self.declare_dissipation(v * i)
         self.when(And(drop < 0, fire > 0.5), assign(active, 1), on=Eq(active, 0), at_start=True)
         self.when(current <= 0, assign(active, 0), on=Eq(active, 1), at_start=True)
 

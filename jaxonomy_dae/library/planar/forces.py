@@ -40,11 +40,8 @@ class SpringDamper(TwoFrames):
             Eq(f, stiffness * (s - relaxed) + damping * v),
             Eq(b.fx, f * dx / s),
             Eq(b.fy, f * dy / s),
-            Eq(a.fx + b.fx, 0),
-            Eq(a.fy + b.fy, 0),
-            Eq(a.tau, 0),
-            Eq(b.tau, 0),
         )
+        self._without_torque()
         self.declare_energy(stiffness * (s - relaxed) ** 2 / 2)
         self.declare_dissipation(damping * v**2)
 

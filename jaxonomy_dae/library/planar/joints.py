@@ -20,6 +20,11 @@ class TwoFrames(Component):
         lever = sympy.sympify(dx) * b.fy - sympy.sympify(dy) * b.fx
         self.add_equations(Eq(a.fx + b.fx, 0), Eq(a.fy + b.fy, 0), Eq(a.tau + b.tau + lever, 0))
 
+    def _without_torque(self) -> None:
+        """The forces sum to zero, and no torque acts on either frame."""
+        a, b = self.ports["frame_a"], self.ports["frame_b"]
+        self.add_equations(Eq(a.fx + b.fx, 0), Eq(a.fy + b.fy, 0), Eq(a.tau, 0), Eq(b.tau, 0))
+
 
 class Revolute(TwoFrames):
     """A pin: two frames at one point, free to turn (Haug 1989, section 3.3).
