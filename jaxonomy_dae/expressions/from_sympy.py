@@ -6,7 +6,7 @@ from fractions import Fraction
 import sympy
 from sympy.codegen import cfunctions
 
-from .functions import apply, polygamma
+from .functions import TABLE, apply, polygamma
 from .node import (
     FALSE,
     ONE,
@@ -115,10 +115,10 @@ def _read(e: sympy.Basic, inside: list[Node]) -> Node:
     if e == sympy.false:
         return FALSE
     kind = type(e)
-    if kind in _NAMED:
-        return apply(_NAMED[kind], *inside)
     if kind in _WRITTEN:
         return _WRITTEN[kind](*inside)
+    if kind in _NAMED:
+        return apply(_NAMED[kind], *inside)
     if isinstance(e, sympy.besseli) and e.args[0] in (0, 1):
         return apply(f"besseli{e.args[0]}", inside[1])
     if isinstance(e, sympy.polygamma) and isinstance(e.args[0], sympy.Integer):
@@ -199,35 +199,6 @@ def _log_to(base: int) -> Callable[[Node], Node]:
     return lambda u: divide(apply("log", u), apply("log", constant(base)))
 
 
-_NAMED = {
-    sympy.exp: "exp",
-    sympy.sin: "sin",
-    sympy.cos: "cos",
-    sympy.tan: "tan",
-    sympy.asin: "asin",
-    sympy.acos: "acos",
-    sympy.atan: "atan",
-    sympy.sinh: "sinh",
-    sympy.cosh: "cosh",
-    sympy.tanh: "tanh",
-    sympy.asinh: "asinh",
-    sympy.acosh: "acosh",
-    sympy.atanh: "atanh",
-    sympy.erf: "erf",
-    sympy.erfc: "erfc",
-    sympy.erfinv: "erfinv",
-    sympy.gamma: "gamma",
-    sympy.loggamma: "loggamma",
-    sympy.Abs: "abs",
-    sympy.sign: "sign",
-    sympy.floor: "floor",
-    sympy.ceiling: "ceiling",
-    sympy.atan2: "atan2",
-    sympy.Mod: "mod",
-    cfunctions.expm1: "expm1",
-    cfunctions.hypot: "hypot",
-}
-
 _WRITTEN: dict[object, Callable[..., Node]] = {
     sympy.Add: add,
     sympy.Mul: product,
@@ -251,7 +222,6 @@ _WRITTEN: dict[object, Callable[..., Node]] = {
     sympy.sec: _reciprocal("cos"),
     sympy.csc: _reciprocal("sin"),
     sympy.coth: _reciprocal("tanh"),
-    sympy.sech: lambda u: apply("sech", u),
     sympy.csch: _reciprocal("sinh"),
     sympy.acot: _of_reciprocal("atan"),
     sympy.asec: _of_reciprocal("acos"),
@@ -280,3 +250,6 @@ _WRITTEN: dict[object, Callable[..., Node]] = {
     cfunctions.Cbrt: lambda u: power(u, Fraction(1, 3)),
     cfunctions.fma: lambda a, b, c: add(multiply(a, b), c),
 }
+
+# Functions of the table that SymPy has under a class of their own; those in `_WRITTEN` are read in another way.
+_NAMED = {function.sympy: name for name, function in TABLE.items() if isinstance(function.sympy, type)}

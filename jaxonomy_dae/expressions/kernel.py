@@ -44,9 +44,7 @@ class Kernel:
                 place[n],
                 n,
                 tuple(place[a] for a in n.arguments),
-                [[(place[c], holds) for c, holds in sorted(p, key=_by_digest)] for p in _sorted(guard[n])]
-                if n in guard
-                else None,
+                [[(place[c], holds) for c, holds in part] for part in _sorted(guard[n])] if n in guard else None,
             )
             for n in order
             if n.operation not in ("leaf", "constant", "true", "false")
@@ -95,12 +93,10 @@ class Kernel:
         return found
 
 
-def _by_digest(literal):
-    return literal[0].digest
-
-
 def _sorted(needed: Iterable) -> list:
-    return sorted(needed, key=lambda part: sorted((c.digest, holds) for c, holds in part))
+    """The intersections of a union, and the literals (condition, truth) in each, in an order without chance."""
+    parts = [sorted(part, key=lambda literal: (literal[0].digest, literal[1])) for part in needed]
+    return sorted(parts, key=lambda part: [(c.digest, holds) for c, holds in part])
 
 
 def is_active(found: list[Numeric], guard: list) -> Numeric:

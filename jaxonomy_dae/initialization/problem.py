@@ -55,7 +55,9 @@ class InitialProblem:
         parameters, dtype = self.point.parameters, self.point.dtype
         both = (*rows.kept, *rows.guess)
         values, sizes = start_values(both, self._given, parameters)
-        kept, units = len(rows.kept), jnp.asarray(_units(rows.guess), dtype)
+        # From a unit of each row's variable to its quantity.
+        units = jnp.asarray([1.0 if row is None else 1.0 / (row.factor or 1.0) for row in rows.guess], dtype)
+        kept = len(rows.kept)
         self.target, self.data = values[:kept], sizes[:kept]
         self.x0 = values[kept:] * units
         self.starts, self._sizes_of_starts = _reader(plan, rows.kept)
@@ -218,17 +220,13 @@ def _distances(plan: SystemPlan, rows: InitialRows, sizes: Any) -> Any:
     if not rows.n_soft:
         return out
     soft = rows.kept[-rows.n_soft :]
-    units = [_unit_of(plan, row.name) for row in soft]
+    index, unit = plan.variable_index, plan.flat.variables.unit
+    units = [unit[index[row.name]] if row.name in index else "" for row in soft]
     same = np.array([[a == b for b in units] for a in units])
     shared = jnp.max(jnp.where(same, sizes[-rows.n_soft :][None, :], 0), axis=1)
     factor = np.abs([row.factor for row in soft])
     nominal = jnp.asarray(factor * declared_scale(plan.model)[[row.quantity for row in soft]], sizes.dtype)
     return out.at[-rows.n_soft :].set(jnp.where(nominal > 0, nominal, shared))
-
-
-def _unit_of(plan: SystemPlan, name: str) -> str:
-    variable = plan.variable_index.get(name)
-    return "" if variable is None else plan.flat.variables.unit[variable]
 
 
 def _reader(plan: SystemPlan, kept: tuple[StartRow, ...]):
@@ -261,11 +259,6 @@ def _reader(plan: SystemPlan, kept: tuple[StartRow, ...]):
 def frozen_inputs(inputs: Any) -> Any:
     """Inputs with their arrays kept out of differentiation."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs)
-
-
-def _units(rows: tuple[StartRow | None, ...]) -> np.ndarray:
-    """The factors from a unit of each row's variable to its quantity."""
-    return np.array([1.0 if row is None else 1.0 / (row.factor or 1.0) for row in rows])
 
 
 def start_values(rows: tuple[StartRow | None, ...], given: list, parameters: Any) -> tuple[Any, Any]:

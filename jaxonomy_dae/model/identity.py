@@ -129,12 +129,9 @@ def _attributes(part: object) -> list[object]:
     """All attributes of an object that is no dataclass, but for those that are computed from others when asked for."""
     kind = type(part)
     slots = [name for base in kind.__mro__ for name in getattr(base, "__slots__", ()) if name != "__weakref__"]
-    own = [name for name in getattr(part, "__dict__", ()) if not _is_computed(kind, name)]
+    computed = functools.cached_property
+    own = [name for name in getattr(part, "__dict__", ()) if not isinstance(getattr(kind, name, None), computed)]
     return [(name, getattr(part, name)) for name in sorted({*slots, *own})]
-
-
-def _is_computed(kind: type, name: str) -> bool:
-    return isinstance(getattr(kind, name, None), functools.cached_property)
 
 
 def _digest(kind: str, *parts: Any) -> bytes:

@@ -90,10 +90,7 @@ def _typed(value: Any, dtype: Any) -> Any:
 
 
 def _derivative(function: Callable, order: int) -> Callable:
-    for _ in range(order):
-        function = _time_derivative(function)
-    return function
-
-
-def _time_derivative(function: Callable) -> Callable:
-    return lambda s: jax.jvp(function, (s,), (jnp.ones_like(s),))[1]
+    if not order:
+        return function
+    below = _derivative(function, order - 1)
+    return lambda s: jax.jvp(below, (s,), (jnp.ones_like(s),))[1]
