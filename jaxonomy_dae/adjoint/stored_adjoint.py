@@ -16,7 +16,7 @@ from jax import lax
 from ..aliases import PyTree, Solver, Terms
 from ..private_names import has_stored_adjoint, private
 from ..programs.members import batch_size
-from .appended import NOTED, apart, together
+from .appended import NOTED, AbstractAppending, apart, together
 from .closure_conversion import SolveProgram, as_traced, by_itself_or_batched, closure_convert, unless_waiting
 from .ends import AttemptedStep, Ending
 from .recorded_loop import solve
@@ -82,6 +82,10 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             for leaf in jax.tree.leaves(_arrays((init_state.y, init_state.solver_state)))
         )
         members = max(self.members, batch_size((terms, given["args"], y, init_state.tprev)))
+        # Beside what events cost, a run by itself does not gain by stages that are written out: the gradient of a
+        # bouncing ball takes 0.26 ms for 0.27, and a fifth longer to be traced.
+        if members == 1 and isinstance(y, AbstractAppending):
+            given["solver"] = solver = _in_a_loop(solver) or solver
         chunk, points = _table(max_steps, size, members)
         too_large = size * (chunk + points) > LARGEST_RECORD
         if given["event"] is not None or saveat.dense or _is_random(terms) or too_large:

@@ -194,7 +194,7 @@ def _started(given: Given, checked: bool, begun: Found | InitialPoint | None) ->
         found = from_state(system, t0, inputs, initial)
     if checked:
         found = check(system, found, t0, inputs, initial, running=True, throw=True)
-    return _Start(system, found, resumed, admitted)
+    return _Start(system.traced_once(), found, resumed, admitted)
 
 
 def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -> _Parts:
@@ -205,7 +205,7 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
     chosen = options.solver if given.ts is None else right_between_steps(options.solver)
     tolerance = largest_tolerance(system, controller)
     solver = prepared(system, chosen, implicit, watch, tolerance, judged=not prescribed)
-    term = term_of(system, implicit, forwards=isinstance(options.adjoint, diffrax.ForwardMode))
+    term = term_of(system, implicit)
     # With an implicit solver the controller chooses the first step itself: `dt0=None`.
     own_start = implicit and not prescribed
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -22,36 +21,10 @@ from ..system.system import AcausalSystem
 SAVED_ITERATIONS = 3
 
 
-class TracedOnce(eqx.Module):
-    """A vector field that is a function of its own in the program around it.
-
-    A solver calls the field a dozen times and more. Each call would be traced, differentiated, batched and lowered by
-    itself: in the fit of a pendulum's drag, a quarter of the time before XLA is at work, and of the program's lines.
-    XLA sees the same, since it puts functions where they are called.
-
-    - `call`: made for one program and let go with it, as are its traces.
-    """
-
-    system: AcausalSystem
-    call: Callable[..., State] = eqx.field(static=True)
-
-    @staticmethod
-    def of(system: AcausalSystem) -> "TracedOnce":
-        """For a program that is traced now."""
-        return TracedOnce(system, eqx.filter_jit(lambda system, t, x, args: system.vector_field(t, x, args)))
-
-    def __call__(self, t: Time, x: State, args: Args) -> State:
-        return self.call(self.system, t, x, args)
-
-
-def term_of(system: AcausalSystem, implicit: bool, forwards: bool = False) -> diffrax.AbstractTerm:
-    """The system as a Diffrax term: an ODE, or with `implicit` a differential-algebraic equation.
-
-    Where it is known to be differentiated `forwards` alone, an explicit field is traced once; reverse mode has its own
-    ways with it.
-    """
+def term_of(system: AcausalSystem, implicit: bool) -> diffrax.AbstractTerm:
+    """The system as a Diffrax term: an ODE, or with `implicit` a differential-algebraic equation."""
     if not implicit:
-        return diffrax.ODETerm(TracedOnce.of(system) if forwards else system.vector_field)
+        return diffrax.ODETerm(system.vector_field)
     plan = system.plan
     field = system.semi_explicit if len(plan.carried) else system.vector_field
     return DAETerm(field, mass=system.mass, pattern=plan.dae_pattern if plan.n_state >= SPARSE_FROM else None)

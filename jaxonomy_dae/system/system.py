@@ -31,6 +31,7 @@ from .nonlinear import Refinement
 from .parameters import Parameters
 from .solver_choice import Stiffness
 from .system_at import SystemAt
+from .traced_once import TracedOnce
 
 
 class AcausalSystem(eqx.Module):
@@ -50,6 +51,7 @@ class AcausalSystem(eqx.Module):
     plan: SystemPlan = eqx.field(static=True)
     stiffness: Stiffness | None = eqx.field(static=True)  # None where no solver is left to be chosen
     modes: Float[Array, "*batch relations"] | None = None  # hidden discrete variables, within a run
+    once: TracedOnce | None = eqx.field(static=True, default=None)  # within a run
 
     # --- names -------------------------------------------------------------------------------------------------
 
@@ -251,12 +253,16 @@ class AcausalSystem(eqx.Module):
 
     # --- computing ---------------------------------------------------------------------------------------------
 
+    def traced_once(self) -> "AcausalSystem":
+        """This system with its field, guards and projection as functions of their own in the program traced now."""
+        return dataclasses.replace(self, once=TracedOnce())
+
     def at(self, t: Time, args: Any = None) -> SystemAt:
         """The system at a time, with these inputs, ready to be evaluated at states."""
         args = read_inputs(self.plan, self.parameters.values.dtype, args)
         check_given(self.plan, args)
         networks = tuple(self.neural[n] for n in self.plan.network_names)
-        return SystemAt(self.plan, self.numbers, networks, t, args, self.typical_sizes)
+        return SystemAt(self.plan, self.numbers, networks, t, args, self.typical_sizes, self.once)
 
     @property
     def numbers(self) -> Float[Array, " m"]:
@@ -287,14 +293,14 @@ class AcausalSystem(eqx.Module):
             array = complete(events.dependents, array.at[chosen].set(values[:n]))
         # A start that is an expression holds at the start alone.
         parameters = Parameters(array, None, (), self.parameters.table.given(chosen))
-        return AcausalSystem(parameters, self.neural, self.typical_sizes, self.plan, None, values[n:])
+        return AcausalSystem(parameters, self.neural, self.typical_sizes, self.plan, None, values[n:], self.once)
 
     def around_event(self, t: Time, values: Any, previous: Any, args: Any = None) -> SystemAt:
         """`at`, with these values of the discrete variables and other values before the present event."""
         held = self.holding(values)
         point = held.at(t, args)
         numbers = point.parameters.at[-len(previous) :].set(previous) if len(previous) else point.parameters
-        return SystemAt(self.plan, numbers, point.networks, t, point.inputs, self.typical_sizes)
+        return SystemAt(self.plan, numbers, point.networks, t, point.inputs, self.typical_sizes, self.once)
 
     @property
     def discrete_values(self) -> Float[Array, " q"]:

@@ -35,14 +35,18 @@ from .input_values import input_values
 from .measured import Measured
 from .nonlinear import Refinement
 from .roots import newton_step
+from .traced_once import TracedOnce, traced_once
 
 
 class SystemAt:
     """A system at one time and state, ready to be evaluated."""
 
-    def __init__(self, plan: SystemPlan, parameters: Array, networks: tuple, t: Time, inputs: Args, typical: Array):
-        """`typical` are the sizes of all quantities, shape (quantities,)."""
-        self.plan = plan
+    def __init__(
+        self, plan: SystemPlan, parameters: Array, networks: tuple, t: Time, inputs: Args, typical: Array,
+        once: TracedOnce | None = None,
+    ):  # fmt: skip
+        """`typical` are the sizes of all quantities, shape (quantities,); `once`: see `traced_once`."""
+        self.plan, self.once = plan, once
         self.typical = jax.lax.stop_gradient(typical)
         self.parameters = parameters
         self.dtype = parameters.dtype
@@ -85,6 +89,7 @@ class SystemAt:
 
     # --- vector field ------------------------------------------------------------------------------------------
 
+    @traced_once
     def vector_field(self, x: Array) -> Array:
         """d(state)/dt, shape (n_state,)."""
         plan = self.plan
@@ -96,6 +101,7 @@ class SystemAt:
             return self._array(slopes, self._values(evaluation, plan.carried_rates))
         return self._array(slopes, self._carried_rates(x, slopes))
 
+    @traced_once
     def semi_explicit(self, x: Array) -> Array:
         """dx/dt of the states, then the residuals of nonlinear blocks, at the state as it is: shape (n_state,)."""
         slopes = self._array(self._slopes(x)[0])
@@ -149,6 +155,7 @@ class SystemAt:
         """The residuals of nonlinear blocks at the tearing variables in the state, shape (carried,)."""
         return self._joined(self.run(self.plan.carried_residuals, x, Refinement.NONE, t=t).residuals)
 
+    @traced_once
     def block_determinants(self, x: Array) -> Array:
         """det ∂g/∂z of every nonlinear block that is written out, shape (blocks,)."""
         plan = self.plan
@@ -172,6 +179,7 @@ class SystemAt:
                 found.append(entries[np.asarray(place[rows.ravel(), columns.ravel()]).reshape(rows.shape) - 1])
         return jnp.concatenate([b[:, 0, 0] if b.shape[-1] == 1 else jnp.linalg.det(b) for b in found])
 
+    @traced_once
     def dummy_determinants(self, x: Array) -> Array:
         """det ∂g/∂z of every block that determines dummy derivatives z, each equation g = 0 in units of its gradient
         with respect to all states, shape (blocks,). Zero where the choice of states is singular."""
@@ -288,6 +296,7 @@ class SystemAt:
         holds = active[self.plan.held.table.owner] > 0
         return jnp.concatenate([residuals, jnp.where(holds, levels, 0.0)])
 
+    @traced_once
     def project(self, x: Array, iterations: int) -> Array:
         """The state moved onto the hidden constraints, and onto those of the modes at hand, by Gauss–Newton steps of
         least (nominal-weighted) norm, and the tearing variables of nonlinear blocks refined."""
@@ -354,12 +363,14 @@ class SystemAt:
 
     # --- events ------------------------------------------------------------------------------------------------
 
+    @traced_once
     def guards(self, x: Array) -> Array:
         """The guards of all events of conditions, shape (guards,)."""
         events = self._events()
         evaluation = self.run(events.guards, x, Refinement.ONCE)
         return self._filled(evaluation, events.guard)
 
+    @traced_once
     def event_values(self, x: Array) -> Array:
         """The values that the actions of all events would write, shape (actions,)."""
         events = self._events()
