@@ -12,7 +12,7 @@ from typing import Any
 from .builtin import FUNCTIONS
 from .flat_model import FlatModel
 from .library import Constant, Found, Library, Member
-from .tree import Call, Class, Comprehension, Declaration, Effect, Loop, Part, Reference, each_part
+from .tree import Call, Class, Comprehension, Declaration, Effect, Loop, Modifiers, Part, Reference, each_part
 
 _BUILT_IN = ("Real", "Integer", "Boolean", "String")
 _RECORDS = ("record", "class")
@@ -102,22 +102,19 @@ class _Writer:
     def declarations(self, found: Found) -> list[tuple[Declaration, tuple[Found, ...]]]:
         """The declarations of a class and its bases, as short definitions change them, each with its scopes."""
         out: dict[str, tuple[Declaration, tuple[Found, ...]]] = {}
-        for part in self._lineage(found):
-            for d in part.source.declarations:
-                out[d.name] = d, part.inside
-            for modifiers, scopes in self._changes_below(part, found):
-                for name, change in modifiers.items():
-                    if name in out and not isinstance(change, Declaration | dict):
-                        out[name] = out[name][0]._replace(value=change), scopes
-        for modifiers, scopes in reversed(found.changes):
-            for name, change in modifiers.items():
-                if name in out and change is not None and not isinstance(change, Declaration | dict):
-                    out[name] = out[name][0]._replace(value=change), scopes
-        return list(out.values())
 
-    def _changes_below(self, part: Found, found: Found):
-        """Modifiers with which a class extends its bases act once the bases are in: with the class itself."""
-        return [(modifiers, part.inside) for _, modifiers in part.source.bases if modifiers]
+        def change(modifiers: Modifiers, scopes: tuple[Found, ...]) -> None:
+            for name, value in modifiers.items():
+                if name in out and value is not None and not isinstance(value, Declaration | dict):
+                    out[name] = out[name][0]._replace(value=value), scopes
+
+        for part in self._lineage(found):
+            out |= {d.name: (d, part.inside) for d in part.source.declarations}
+            for _, modifiers in part.source.bases:  # which are in now
+                change(modifiers, part.inside)
+        for modifiers, scopes in reversed(found.changes):
+            change(modifiers, scopes)
+        return list(out.values())
 
     def _lineage(self, found: Found) -> list[Found]:
         """What a class continues or extends, the first base first, and the class itself."""

@@ -13,11 +13,8 @@ Sides = tuple[Value, Value]
 
 def write_equation(scope: Scope, s: Statement) -> None:
     """Adds the equations of one statement to the component."""
-    if isinstance(s, Equality):
-        for sides in equal(scope, s.left, s.right):
-            add(scope, sides)
-    elif isinstance(s, Branches):
-        for sides in side_by_side(scope, s):
+    if isinstance(s, Equality | Branches):
+        for sides in equal(scope, s.left, s.right) if isinstance(s, Equality) else side_by_side(scope, s):
             add(scope, sides)
     elif isinstance(s, Effect):
         if s.call.function == "connect":

@@ -63,22 +63,13 @@ class Evaluator:
         path = e.path
         if path in self.literals:
             return self.literals[path]
-        if not any(e.subscripts):
+        written = self._entry_name(e, names) if any(e.subscripts) else path
+        if written is not None:
             try:
-                return names(path)
+                return names(written)
             except KeyError:
                 pass
-        return self._by_parts(e, names)
-
-    def _by_parts(self, e: tree.Reference, names: Names) -> Value:
-        """A reference into an array or record: the longest beginning that has a name, then fields and subscripts."""
-        if any(e.subscripts):
-            written = self._entry_name(e, names)
-            if written is not None:
-                try:
-                    return names(written)
-                except KeyError:
-                    pass
+        # It leads into an array or a record: the longest beginning that has a name, then fields and subscripts.
         for n in range(len(e.parts), 0, -1):
             try:
                 value = names(".".join(e.parts[:n]))

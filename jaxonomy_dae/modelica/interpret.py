@@ -189,12 +189,10 @@ class Interpreter(Evaluator):
                 where: Value = list(range(1, len(entries) + 1))
             else:
                 where = self.evaluate(first, with_end(names, len(entries)))
+            if not isinstance(where, list | int | float):
+                raise ModelError(f"the place of an assigned entry must be constant; got {where}")
             if not isinstance(where, list):
-                if not isinstance(where, int | float):
-                    raise ModelError(f"the place of an assigned entry must be constant; got {where}")
-                k = index_of(where, len(entries))
-                entries[k] = self._changed(entries[k], tuple(others), parts, rest, value, names)
-                return entries
+                where, value = [where], [value]
             for k, v in zip(where, value, strict=True):
                 at = index_of(k, len(entries))
                 entries[at] = self._changed(entries[at], tuple(others), parts, rest, v, names)
