@@ -21,11 +21,9 @@ from .read_equations import read_expression
 def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
     records: list[tuple[Variable, int, int]] = []  # variables as declared, each with its port and its potential
     potentials: dict[tuple[str, str], int] = {}
-    record = np.empty(model.n_variables, np.int64)
-    owner = np.empty(model.n_variables, np.int64)
+    record = np.empty(model.n_variables, np.int32)
     places: list[int] = []
     rows: list[int] = []
-    owners: list[int] = []
     started: list[tuple[Variable, Instances, int]] = []
     for i in model.instances:
         component = i.component
@@ -45,21 +43,18 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
             start = int(i.variable[0])
             places.extend(range(start, start + n))
             rows.extend(range(first, first + n))
-            owners.extend([int(i.number[0])] * n)
         else:
-            at = i.variable[:, None] + np.arange(n)
-            record[at] = first + np.arange(n)
-            owner[at] = i.number[:, None]
-    record[places], owner[places] = rows, owners
+            record[i.variable[:, None] + np.arange(n)] = first + np.arange(n)
+    record[places], owner = rows, model.variable_names.owner
 
     def column(of, dtype: DTypeLike) -> np.ndarray:
         return np.array([of(*entry) for entry in records], dtype)[record]
 
-    first_port = np.empty(model.n_components, np.int64)
+    first_port = np.empty(model.n_components, np.int32)
     for i in model.instances:
         first_port[i.number] = i.port
-    own_port = column(lambda v, p, a: p, np.int64)
-    port = np.where(own_port >= 0, first_port[owner] + own_port, -1)
+    own_port = column(lambda v, p, a: p, np.int32)
+    port = np.where(own_port >= 0, first_port[owner] + own_port, np.int32(-1))
     is_input = column(lambda v, p, a: v.kind == "input", bool)
     is_input[list(driven)] = False
     default = column(lambda v, p, a: v.default, object)
@@ -77,7 +72,7 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
         default=default.tolist(),
         owner=owner,
         port=port,
-        potential=column(lambda v, p, a: a, np.int64),
+        potential=column(lambda v, p, a: a, np.int32),
         potentials=tuple(potentials),
         is_internal=column(lambda v, p, a: v.kind in ("start", "event"), bool),
     )

@@ -86,7 +86,7 @@ def _rounds(matrix: Any) -> tuple[list[_Round], Any]:
         rank = np.where(degree <= NEIGHBOURS, degree.astype(np.int64) * n + rng.permutation(n), np.iinfo(np.int64).max)
         # Those that come before all of their neighbours; each row has an entry, on the diagonal.
         is_first = (rank <= np.minimum.reduceat(rank[matrix.indices], matrix.indptr[:-1])) & (degree <= NEIGHBOURS)
-        eliminated, kept = np.flatnonzero(is_first), np.flatnonzero(~is_first)
+        eliminated, kept = (np.flatnonzero(which).astype(matrix.indices.dtype) for which in (is_first, ~is_first))
         if len(eliminated) < SHARE * n:
             break
         pivot, between = matrix.diagonal()[eliminated], matrix[eliminated][:, kept]

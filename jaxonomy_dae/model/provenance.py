@@ -54,12 +54,12 @@ class Provenances(Sequence[Provenance]):
         """The provenances of a list."""
         entries = list(entries)
         written = np.array([p.is_written for p in entries], bool)
-        return cls((entries.__getitem__,) * 2, (False, True), written.astype(np.int64), np.arange(len(entries)))
+        return cls((entries.__getitem__,) * 2, (False, True), written.astype(np.int32), np.arange(len(entries)))
 
     @classmethod
     def made(cls, source: "Source", items: np.ndarray, is_written: bool) -> "Provenances":
         """The provenances that a function makes of numbers."""
-        return cls((source,), (is_written,), np.zeros(len(items), np.int64), np.asarray(items, np.int64))
+        return cls((source,), (is_written,), np.zeros(len(items), np.int32), np.asarray(items, np.int64))
 
     @classmethod
     def joined(cls, parts: Sequence["Provenances"]) -> "Provenances":
@@ -70,7 +70,7 @@ class Provenances(Sequence[Provenance]):
         sources: list[Source] = []
         source = []
         for part in parts:
-            own = np.empty(len(part._sources), np.int64)
+            own = np.empty(len(part._sources), np.int32)
             for k, (function, written) in enumerate(zip(part._sources, part._written, strict=True)):
                 own[k] = places.setdefault((id(function), written), len(sources))
                 if own[k] == len(sources):
