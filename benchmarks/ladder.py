@@ -199,10 +199,12 @@ MODELS = {"ladder": ladder, "array": array, "grid": grid, "chain": chain, "resis
 
 
 def reference(n: int) -> np.ndarray:
-    """The ladder's capacitor voltages at the end, by SciPy's Radau with a sparse Jacobian."""
+    """The voltages of the first, the middle and the last capacitor at the end, by SciPy's Radau with a sparse Jacobian.
+    Until then a voltage spreads over some ten cells, so that a long ladder needs no longer reference."""
     import scipy.integrate
     import scipy.sparse as sp
 
+    n = min(n, 20_000)
     main = np.full(n, -2.0)
     main[-1] = -1.0
     a = sp.diags_array([np.ones(n - 1), main, np.ones(n - 1)], offsets=[-1, 0, 1], format="csc")
@@ -211,7 +213,7 @@ def reference(n: int) -> np.ndarray:
     found = scipy.integrate.solve_ivp(
         lambda t, v: a @ v + b, (0.0, END), np.zeros(n), method="Radau", jac=a, rtol=1e-8, atol=1e-11
     )
-    return found.y[:, -1]
+    return found.y[[0, n // 2, n - 1], -1]
 
 
 def measure(kind: str, n: int) -> dict:
@@ -231,6 +233,7 @@ def measure(kind: str, n: int) -> dict:
         out[name] = time.perf_counter() - begin
         return value
 
+    begun = time.process_time()
     ev, diagram = lap("build", lambda: MODELS[kind](n))
     system = lap("compile", AcausalCompiler(ev, diagram))
     end = END if kind in ("ladder", "array") else 1.0
@@ -241,6 +244,7 @@ def measure(kind: str, n: int) -> dict:
         return solution
 
     solution = lap("first", solve)
+    out["cpu"] = time.process_time() - begun
     out["steady"] = min((lap("steady", solve), out["steady"])[1] for _ in range(3))
     out["equations"] = system.report.n_equations
     out["index"] = system.report.index
@@ -250,7 +254,7 @@ def measure(kind: str, n: int) -> dict:
         nodes = [0, n // 2, n - 1]
         names = [f"c{k}.v" if kind == "ladder" else f"c[{k}].v" for k in nodes]
         voltages = np.array([solution[name][0] for name in names])
-        out["error"] = float(np.max(np.abs(voltages - reference(n)[nodes])))
+        out["error"] = float(np.max(np.abs(voltages - reference(n))))
     if kind == "resistors":
         found = system.observe([f"c{k}.i" for k in range(4)], 0.0, system.initialize())
         out["error"] = float(np.max(np.abs(found - currents(n))))

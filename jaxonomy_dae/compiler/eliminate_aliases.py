@@ -58,16 +58,15 @@ class _Classes:
         n = len(v)
         # The better root: an input, then what is differentiated, fixed, started, no port variable; then the first.
         better = np.lexsort((-np.arange(n), ~v.is_port, v.start.is_given, v.fixed, differentiated, v.is_input))
-        merit = np.empty(n, np.int64)
-        merit[better] = np.arange(n)
-        zeros = np.zeros(n, np.int64)
-        return cls(np.arange(n), zeros, np.ones(n), zeros.copy(), np.zeros((n, 2)), merit, v.is_input)
+        merit, zeros = np.empty(n, np.int32), np.zeros(n, np.int32)
+        merit[better] = own = np.arange(n, dtype=np.int32)
+        return cls(own, zeros, np.ones(n), zeros.copy(), np.zeros((n, 2)), merit, v.is_input)
 
     def link(self, old: np.ndarray, root: np.ndarray, order: np.ndarray, factor: np.ndarray, products: np.ndarray):
         """Makes former roots factor·(root)^(order), and all variables that had them, too."""
         n = len(self.root)
-        to = np.arange(n + 1)  # the last place is ZERO's
-        more, times, count = np.zeros(n + 1, np.int64), np.ones(n + 1), np.zeros(n + 1, np.int64)
+        to = np.arange(n + 1, dtype=np.int32)  # the last place is ZERO's
+        more, times, count = np.zeros(n + 1, np.int32), np.ones(n + 1), np.zeros(n + 1, np.int32)
         to[old], more[old], times[old], count[old] = root, order, factor, products
         to[n] = ZERO
         own = self.root
@@ -114,8 +113,8 @@ def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], Alia
     used = np.flatnonzero(~rest)
     provenance = Provenances.joined([g.provenance for g in linear])
     table = AliasTable(
-        classes.root,
-        np.where(is_zero, 0, classes.order),
+        classes.root.astype(np.int64),
+        np.where(is_zero, 0, classes.order.astype(np.int64)),
         np.where(is_zero, 0.0, classes.factor),
         provenance.take(used),
         replaced[used],
@@ -134,11 +133,11 @@ def _canonical(terms: _Terms, classes: _Classes) -> _Terms:
     """The rows in roots, terms of equal quantity merged; what rounding leaves of terms that cancel is nothing. Terms
     stay in the order they were written in."""
     is_there = np.append(classes.root, ZERO)[terms.variable] != ZERO
-    terms = terms if is_there.all() else terms.take(is_there)
+    terms = terms.take(is_there)
     v, row = terms.variable, terms.row
-    factor = classes.factor[v]
-    coefficient = factor * terms.coefficient
-    noise = np.abs(factor) * terms.noise + EPS * classes.products[v] * np.abs(coefficient)
+    coefficient = classes.factor[v] * terms.coefficient
+    noise = np.abs(classes.factor)[v] * terms.noise
+    noise += EPS * classes.products[v] * np.abs(coefficient)
     root, order = classes.root[v], terms.order + classes.order[v]
     kept = np.ones(len(row), bool)
     some = np.flatnonzero(_may_repeat(row, root, order)[row])

@@ -181,17 +181,18 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[StartRow],
     is_zero, leading = variables.start.is_zero, set(plan.leading.tolist())
     started: dict[int, StartRow] = {}
     fixed: list[StartRow] = []
-    for v in np.flatnonzero(variables.start.is_given).tolist():
-        quantity, factor = plan.quantity_of(v)
-        if quantity == ABSENT:
-            continue
-        if quantity == ZERO and not (variables.fixed[v] and not is_zero[v]):
-            continue  # zero as it should be; any other fixed start must turn out to be zero
-        row = StartRow(variables.names[v], quantity, factor, variables.start[v])
-        if variables.fixed[v] and quantity not in overridden:
+    quantity, factor = plan.variable_map.quantity, plan.variable_map.factor
+    # A start of what is identically zero says nothing if it is zero, too; a fixed one must turn out to be so.
+    tells = (quantity != ABSENT) & ((quantity != ZERO) | (variables.fixed & ~is_zero))
+    chosen = np.flatnonzero(variables.start.is_given & tells)
+    columns = (chosen, quantity[chosen], factor[chosen], variables.fixed[chosen])
+    starts = variables.start.of(chosen)
+    for v, q, s, is_fixed, start in zip(*(c.tolist() for c in columns), starts, strict=True):
+        row = StartRow(variables.names[v], q, s, start)
+        if is_fixed and q not in overridden:
             fixed.append(row)
         if v in leading:
-            started[quantity] = row
+            started[q] = row
     return overrides, fixed, started
 
 

@@ -16,7 +16,7 @@ from ..model.tables import ZERO, FlatModel
 from ..modeling.events import EventFlag
 from .gather import NOTHING, Gather
 from .program import Program
-from .schedule import AnyStep
+from .schedule import AnyStep, Step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,8 @@ def plan_events(
     values, value = read_variables(variables, table.value, program)
     position = {int(q): k for k, q in enumerate(states)}
     place, factor = np.full(len(table.state), -1, np.int64), np.ones(len(table.state))
-    for row, v in enumerate(table.state.tolist()):
+    begun: dict[tuple[int, int], int] = {}  # the variable that each event starts anew at a place in the state
+    for row, (v, event) in enumerate(zip(table.state.tolist(), table.event.tolist(), strict=True)):
         if v < 0:
             continue
         quantity, scale = variables[v]
@@ -93,12 +94,12 @@ def plan_events(
                 f"state: the equations determine it at every instant. The states are {shown or 'none'}"
             )
         place[row], factor[row] = position[quantity], scale
-        for other in range(row):
-            if table.event[other] == table.event[row] and place[other] == place[row]:
-                raise ModelError(
-                    f"{table.text[table.event[row]]}: '{flat.variables.names[table.state[other]]}' and "
-                    f"'{flat.variables.names[v]}' are one state, which is given two values by one event: reinit one"
-                )
+        other = begun.setdefault((event, position[quantity]), v)
+        if other != v:
+            raise ModelError(
+                f"{table.text[event]}: '{flat.variables.names[other]}' and '{flat.variables.names[v]}' are one state, "
+                "which is given two values by one event: reinit one"
+            )
     choices, choice_guards = _choices(table, flat.held)
     return EventPlan(
         table=table,
@@ -172,43 +173,61 @@ def _reads(flat: FlatModel, variables: QuantityMap, steps: Sequence[AnyStep], n:
     """The discrete variables that each event reads as they are at its instant, through equations too. Those of
     relations are left out: they have one event that sets them either way."""
     table = flat.events
+    out: list[set[int]] = [set() for _ in table.events]
+    if not (table.discrete >= 0).any():  # there is nothing to read
+        return out
     place = {int(p): k for k, p in enumerate(flat.parameters.discrete)}
-    out = []
-    for event in range(len(table)):
-        values = table.value[(table.event == event) & (table.value >= 0)]
+    behind = _Behind(steps, n)
+    for event, value in zip(table.event.tolist(), table.value.tolist(), strict=True):
         is_relation = event >= table.n_clocks and EventFlag.RELATION in table.events[event].flags
-        if is_relation or not len(values):
-            out.append(set())
-            continue
-        found = _parameters_behind(variables.quantity[values], steps, n)
-        out.append({place[p] for p in found if p in place})
+        if value >= 0 and not is_relation:
+            out[event] |= {place[p] for p in behind.parameters(int(variables.quantity[value])) if p in place}
     return out
 
 
-def _parameters_behind(quantities: np.ndarray, steps: Sequence[AnyStep], n: int) -> set[int]:
-    """The parameters of all equations that determine quantities, states apart."""
-    wanted = np.zeros(n, bool)
-    wanted[quantities[quantities != ZERO]] = True
-    found: set[int] = set()
-    for step in reversed(steps):
-        for equation, rows in step.behind(wanted):
-            found.update(np.unique(equation.parameter[rows]).tolist())
-            quantity = equation.outside[rows]
-            wanted[quantity[quantity != ZERO]] = True
-    return found
+class _Behind:
+    """What the steps read to determine each quantity; a quantity is looked into when it is first asked for."""
+
+    def __init__(self, steps: Sequence[AnyStep], n: int):
+        self._steps, self._step, self._row = steps, np.full(n, -1), np.zeros(n, np.int64)
+        for k, step in enumerate(steps):
+            for unknown in step.unknown:
+                self._step[unknown], self._row[unknown] = k, np.arange(len(unknown))
+
+    def parameters(self, quantity: int) -> set[int]:
+        """The parameters of all equations that determine a quantity, states apart."""
+        found: set[int] = set()
+        waiting, seen = [quantity] if quantity >= 0 else [], {quantity, ZERO}
+        done: set[tuple[int, int]] = set()
+        while waiting:
+            q = waiting.pop()
+            k = int(self._step[q])
+            row = int(self._row[q]) if k >= 0 and isinstance(self._steps[k], Step) else -1
+            if k < 0 or (k, row) in done:
+                continue
+            done.add((k, row))
+            for equation in self._steps[k].equations:
+                rows = slice(None) if row < 0 else row
+                found.update(equation.parameter[rows].ravel().tolist())
+                more = set(equation.outside[rows].ravel().tolist()) - seen
+                seen |= more
+                waiting.extend(more)
+        return found
 
 
 def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
     """The events in the order in which they happen at one instant: those that write what others read come first,
     sampled ones before conditions."""
-    writes = [set(table.discrete[(table.event == e) & (table.discrete >= 0)].tolist()) for e in range(len(reads))]
+    writers: dict[int, list[int]] = {}
+    for e, written in zip(table.event.tolist(), table.discrete.tolist(), strict=True):
+        writers.setdefault(written, []).append(e)
     n = table.n_clocks
 
     def sorted_by_reads(events: range) -> list[int]:
         sorter: graphlib.TopologicalSorter[int] = graphlib.TopologicalSorter({e: () for e in events})
         readers = [e for e in events if reads[e]]
         for e in readers:
-            sorter.add(e, *(k for k in events if k != e and reads[e] & writes[k]))
+            sorter.add(e, *sorted({k for read in reads[e] for k in writers.get(read, ()) if k != e and k in events}))
         return list(sorter.static_order())
 
     try:

@@ -32,14 +32,16 @@ def entries_of(groups: tuple[EquationGroup, ...], unknown: np.ndarray) -> Entrie
 
 
 def slots_of(groups: Sequence[EquationGroup]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(equation, variable, order) of all slots, row by row."""
-    none, first = [np.zeros(0, np.int64)], equation_offsets(groups)
-    row = [np.repeat(k + np.arange(len(g)), g.variable.shape[1]) for k, g in zip(first[:-1], groups, strict=True)]
-    return (
-        np.concatenate(none + row),
-        np.concatenate(none + [group.variable.ravel() for group in groups]),
-        np.concatenate(none + [group.order.ravel() for group in groups]),
+    """(equation, variable, order) of all slots, row by row: 32-bit integers, as there are more slots than anything
+    else."""
+    first = equation_offsets(groups).astype(np.int32)
+    row = [np.repeat(np.arange(a, b), g.variable.shape[1]) for a, b, g in zip(first, first[1:], groups, strict=False)]
+    none, variable, order = [np.zeros(0, np.int32)], [g.variable for g in groups], [g.order for g in groups]
+    row, variable, order = (
+        np.concatenate(none + [np.ravel(part).astype(np.int32, copy=False) for part in parts])
+        for parts in (row, variable, order)
     )
+    return row, variable, order
 
 
 def incidence(groups: tuple[EquationGroup, ...], column: np.ndarray, n_columns: int) -> Incidence:

@@ -29,6 +29,8 @@ class Columns:
 
     def take(self: C, rows: Rows) -> C:
         """The record of these rows."""
+        if isinstance(rows, np.ndarray) and rows.dtype == bool and rows.all():
+            return self
         columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         chosen = {n: c[rows] for n, c in columns.items() if isinstance(c, np.ndarray)}
         chosen |= {n: c.take(rows) for n, c in columns.items() if isinstance(c, Provenances)}

@@ -90,6 +90,12 @@ class Starts(Sequence[Start | None]):
             group.put(out, parameters)
         return out
 
+    def of(self, variables: np.ndarray) -> list[Start]:
+        """The starts of variables that have one."""
+        place, row = self._place[variables].T.tolist()
+        listed = [group.parameter.tolist() for group in self.groups]
+        return [Start(self.groups[k].template, tuple(listed[k][i])) for k, i in zip(place, row, strict=True)]
+
     def padded(self, extra: int) -> "Starts":
         """A copy with `extra` more variables, which have no start."""
         return Starts(len(self) + extra, self.groups)
