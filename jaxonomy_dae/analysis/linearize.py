@@ -80,7 +80,7 @@ def linearize(
     _check_inputs(system, names, given, at)
     if at is None:
         found, t, read = equilibrium_from(system, t, given, None, Drifting(), throw=None)
-        at = point_of(system, found, t, read, drifting=(), singular_is_error=False, throw=None)
+        at = point_of(system, found, t, read, drifting=Drifting(), singular_is_error=False, throw=None)
     if jnp.ndim(at.x) != 1:
         raise ModelError("the operating point is a batch: linearize each with equinox.filter_vmap")
     values = read_inputs(system.plan, dtype, {**by_entry(system.plan, at.inputs), **given})

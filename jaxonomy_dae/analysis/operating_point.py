@@ -10,10 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..aliases import Args, Time
 from ..errors import ModelError
-from ..programs.cache import compiled
-from ..programs.staging import is_staged
 from ..system.system import AcausalSystem
 
 SHOWN = 8  # states in the text of a point
@@ -59,11 +56,8 @@ class OperatingPoint(eqx.Module):
         names = (
             [name] if single else [n for one in name for n in ([one] if one in discrete else plan.entry_names([one]))]
         )
-        quantity, factor = plan.resolve([n for n in names if n != "time" and n not in discrete])
-        given = (self.system, self.t, self.x, self.inputs)
-        values = _every_quantity(*given) if is_staged(given) else _compiled(*given)
-        zero = jnp.asarray(quantity < 0)
-        found = iter(jnp.where(zero, 0.0, values[np.maximum(quantity, 0)] * jnp.asarray(factor, self.x.dtype)))
+        continuous = [n for n in names if n != "time" and n not in discrete]
+        found = iter(self.system.observe(continuous, self.t, self.x, self.inputs) if continuous else ())
         modes = self.system.discrete_values
         read = [self.t if n == "time" else modes[discrete.index(n)] if n in discrete else next(found) for n in names]
         return read[0] if single else jnp.stack(read) if read else jnp.zeros((0,), self.x.dtype)
@@ -95,11 +89,3 @@ def _text(value: Any) -> str:
     if isinstance(value, Tracer):
         return str(value)
     return f"{float(value):.6g}" if np.ndim(value) == 0 else f"shape {np.shape(value)}"
-
-
-def _every_quantity(system: AcausalSystem, t: Time, x: Array, inputs: Args) -> Array:
-    every = np.arange(system.plan.extended.quantities.n)
-    return system.at(t, inputs).quantities(x, every, np.ones(len(every)))
-
-
-_compiled = compiled(_every_quantity)

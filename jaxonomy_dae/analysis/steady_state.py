@@ -85,7 +85,7 @@ def steady_state(
     check_system(system)
     places = _places(system, drifting)
     found, t, inputs = equilibrium_from(system, t, inputs, initial, places, throw)
-    return point_of(system, found, t, inputs, drifting=tuple(drifting), singular_is_error=True, throw=throw)
+    return point_of(system, found, t, inputs, drifting=places, singular_is_error=True, throw=throw)
 
 
 def equilibrium_from(
@@ -113,7 +113,7 @@ def equilibrium_from(
 
 
 def point_of(
-    system: AcausalSystem, found: Equilibrium, t: Time, inputs: Args, *, drifting: tuple[str, ...],
+    system: AcausalSystem, found: Equilibrium, t: Time, inputs: Args, *, drifting: Drifting,
     singular_is_error: bool, throw: bool | None,
 ) -> OperatingPoint:  # fmt: skip
     """The point, if it is one."""
@@ -174,7 +174,7 @@ def _places(system: AcausalSystem, drifting: Sequence[str]) -> Drifting:
 # --- what is said when there is none -------------------------------------------------------------------------------
 
 
-def _not_found(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, ...]) -> str:
+def _not_found(system: AcausalSystem, found: Equilibrium, drifting: Drifting) -> str:
     if int(found.event) >= 0:
         return _restless(system, int(found.event))
     residual, limit = np.abs(np.asarray(found.residual)), np.asarray(found.limit)
@@ -215,7 +215,7 @@ def _restless(system: AcausalSystem, event: int) -> str:
     )
 
 
-def _singular(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, ...]) -> str:
+def _singular(system: AcausalSystem, found: Equilibrium, drifting: Drifting) -> str:
     loose = _undetermined(system, found, drifting)
     return (
         f"the equilibrium is singular: nothing determines {_directions(loose)}. To keep the value at the start, say "
@@ -232,7 +232,7 @@ def _first_names(loose: list[list[str]]) -> str:
     return f"[{', '.join(repr(names[0]) for names in loose[:WORST])}{', …' if len(loose) > WORST else ''}]"
 
 
-def _undetermined(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, ...]) -> list[list[str]]:
+def _undetermined(system: AcausalSystem, found: Equilibrium, drifting: Drifting) -> list[list[str]]:
     """The states in each direction that nothing determines."""
     if not found.jacobian.shape[1] or not bool(jnp.all(jnp.isfinite(found.jacobian))):
         return []
@@ -245,9 +245,9 @@ def _undetermined(system: AcausalSystem, found: Equilibrium, drifting: tuple[str
     return [names for k, names in enumerate(loose) if names not in loose[:k]]
 
 
-def _enough(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, ...]) -> str:
+def _enough(system: AcausalSystem, found: Equilibrium, drifting: Drifting) -> str:
     """States that may drift so that the others are determined: a mass that friction holds keeps its place and speed."""
-    names, n_rows = _unknown_names(system, drifting), len(unknowns(system.plan, _places(system, drifting).states))
+    names, n_rows = _unknown_names(system, drifting), len(unknowns(system.plan, drifting.states))
     kept, left = list(range(len(names))), found
     while len(kept) and (loose := np.flatnonzero(np.asarray(is_open(open_directions(left)[0])))).size:
         direction = np.abs(np.asarray(open_directions(left)[1]))[loose[0]]
@@ -259,28 +259,27 @@ def _enough(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, ...]
     return f"[{', '.join(map(repr, chosen[:WORST]))}{', …' if len(chosen) > WORST else ''}]"
 
 
-def _unknown_names(system: AcausalSystem, drifting: tuple[str, ...]) -> list[str]:
-    places = _places(system, drifting)
+def _unknown_names(system: AcausalSystem, drifting: Drifting) -> list[str]:
     every = [*system.states, *system.carried]
-    events = resting_events(system.plan, places.discrete, places.states)
+    events = resting_events(system.plan, drifting.discrete, drifting.states)
     sampled = [] if events is None else [system.discretes[k] for k in events.unknown.tolist()]
-    return [every[k] for k in unknowns(system.plan, places.states)] + sampled
+    return [every[k] for k in unknowns(system.plan, drifting.states)] + sampled
 
 
-def _row_names(system: AcausalSystem, drifting: tuple[str, ...]) -> list[str]:
+def _row_names(system: AcausalSystem, drifting: Drifting) -> list[str]:
     plan = system.plan
     rows = [f"der({n})" for n in system.states] + [f"the equation that determines {n}" for n in system.carried]
-    rows = [rows[k] for k in unknowns(plan, _places(system, drifting).states)]
+    rows = [rows[k] for k in unknowns(plan, drifting.states)]
     rows += [f"the constraint {plan.describe(int(e))}" for e in plan.selection.constraints]
     if plan.held is not None:
         rows += [f"the branch {plan.held.table.text[k]}" for k in plan.held.table.owner.tolist()]
     return rows + [f"the change of {name}" for name in _written_names(system, drifting)]
 
 
-def _written_names(system: AcausalSystem, drifting: tuple[str, ...]) -> list[str]:
+def _written_names(system: AcausalSystem, drifting: Drifting) -> list[str]:
     """The variables that clocks write, one for each row of ticks."""
-    plan, places = system.plan, _places(system, drifting)
-    events = resting_events(plan, places.discrete, places.states)
+    plan = system.plan
+    events = resting_events(plan, drifting.discrete, drifting.states)
     if events is None or plan.events is None:
         return []
     table = plan.events.table
