@@ -188,6 +188,15 @@ def test_units_of_a_network_s_inputs_and_outputs_do_not_matter():
         np.testing.assert_allclose(spread, laws[1][1], rtol=1e-5)
 
 
+@pytest.mark.long("residuals with and without their Jacobian, predictions")
+def test_bands_of_new_experiments_are_those_of_fitted_ones():
+    """Changes of weights were taken as if all weights had the unit one, so that bands of new experiments were wrong."""
+    fit = learning.Problem(system(), record(seed=3), train=["c.f"]).fit()
+    assert fit.objective.coordinates.shifts is not None and (fit.objective.coordinates.size != 1).any()
+    known, new = fit.predict("c.x"), fit.predict("c.x", experiment=record(seed=3))
+    np.testing.assert_allclose(new.high["c.x"] - new.low["c.x"], known.high["c.x"] - known.low["c.x"], rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_a_filter_looks_for_a_smoother_law_too():
     """A fit of a network by a filter ended in an error where it looked for a smoother law."""
