@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
+from scipy.special import chdtrc
 
 from ..aliases import PyTree
 from ..system.system import AcausalSystem
@@ -70,6 +71,8 @@ AWAY = 1e9
 FEW = 8  # columns up to which residuals alone cost almost as much as with their Jacobian, and a program of their own
 MANY = 40  # numbers of one experiment beyond which a gradient backwards costs less: of 97, 6 ms where forwards it is 14
 
+
+DOUBTED = 0.02  # the probability of χ² below which a fit goes on from another start: that at which it is not `ok`
 
 Same = TypeVar("Same", bound="Objective")
 Weigh = Callable[[np.ndarray, Evaluation], Weights]
@@ -367,6 +370,12 @@ class Objective:
         natural = dict(zip(self.coordinates.names, self.coordinates.natural(self.full(z)), strict=True))
         names = (self.stacked.outputs[j] for j in self.predictor.levels)
         return self.evidence.sigma(weights) | {name: float(natural[f"sigma of {name}"]) for name in names}
+
+    def is_improbable(self, found: Minimum) -> bool:
+        """True if residuals at a minimum are larger than their known noise makes them, whatever a fit takes of it."""
+        known = (self.evidence.noise < 0) & (not self.has_variances)
+        chi2 = np.sum(found.weights.bent(found.found.residual)[0][known] ** 2)
+        return bool(known.any() and chdtrc(np.sum(found.weights.share[known] ** 2), chi2) < DOUBTED)
 
     def surprise(self, found: Minimum) -> float:
         """−ln (likelihood) at a minimum, less a constant, with the priors that were given: by it, minima of the same
