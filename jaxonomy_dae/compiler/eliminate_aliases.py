@@ -96,8 +96,8 @@ def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], Alia
         terms = _canonical(terms.take(rest[terms.row]), classes)
         found = _join(terms, n_rows, classes)
         if (found == ZERO).all():
-            rows = np.unique(terms.row) if sweep >= SWEEPS else _short(terms, n_rows)
-            short = terms.take(np.isin(terms.row, rows))
+            count, _ = _starts(terms, n_rows)
+            short = terms if sweep >= SWEEPS else terms.take(count[terms.row] <= 2)
             # Equal variables are joined before multiples of each other, so that the order of equations does not decide
             # whether a velocity is named by its position or a position by its acceleration (v = x' and v' = −k·x).
             found = _follow(short, n_rows, classes, multiples=False)
@@ -170,12 +170,6 @@ def _starts(terms: _Terms, n_rows: int) -> tuple[np.ndarray, np.ndarray]:
     """For each row, the number of its terms and the place of the first one."""
     count = np.bincount(terms.row, minlength=n_rows)
     return count, np.cumsum(count) - count
-
-
-def _short(terms: _Terms, n_rows: int) -> np.ndarray:
-    """The rows of one or two terms."""
-    count, _ = _starts(terms, n_rows)
-    return np.flatnonzero((count >= 1) & (count <= 2))
 
 
 def _join(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:

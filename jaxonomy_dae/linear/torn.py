@@ -374,12 +374,10 @@ def _quotient(a: Scalar, b: Scalar) -> Scalar:
 
 def _product(a: Scalar, x: Scalar) -> Scalar:
     if isinstance(a, int | float):
-        return x if a == 1 else _negative(x) if a == -1 else a * x
+        if abs(a) != 1:
+            return a * x
+        return x if a == 1 else -x if isinstance(x, int | float) else jax.lax.neg(x)
     return x * a if isinstance(x, int | float) else _binary(jax.lax.mul, jnp.multiply, a, x)
-
-
-def _negative(x: Scalar) -> Scalar:
-    return -x if isinstance(x, int | float) else jax.lax.neg(x)
 
 
 def _less(value: Scalar, terms: list[Scalar]) -> Scalar:

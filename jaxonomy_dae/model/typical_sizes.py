@@ -23,11 +23,7 @@ def typical_sizes(
 ) -> Float[np.ndarray, " quantities"]:
     """The typical sizes of all quantities, at these values of the parameters; powers of two, by which numbers are
     multiplied without rounding."""
-    return _rounded(unrounded_sizes(model, parameters))
-
-
-def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " quantities"]:
-    return 2.0 ** np.round(np.log2(sizes))
+    return 2.0 ** np.round(np.log2(unrounded_sizes(model, parameters)))
 
 
 def unrounded_sizes(
