@@ -11,6 +11,7 @@ solution of least norm (iterated Tikhonov regularization; Engl, Hanke & Neubauer
 A square matrix that is far from singular has one solution, which its own factors give in a fifth of the time.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -53,13 +54,18 @@ class SparseLeastSquares:
 def regular_factors(matrix: Any) -> Callable[[np.ndarray], np.ndarray] | None:
     """The solution for right-hand sides, given a square sparse matrix with entries near one; None if the matrix has
     a singular value that least squares would leave out."""
+    # SuperLU orders columns, and puts a full one last; a full row, such as that of a node where all of an array meets,
+    # would fill the factors: 6.5 GB for 20,000 cells.
+    by_rows, by_columns = sp.csr_array(matrix), sp.csc_array(matrix)
+    turned = np.diff(by_rows.indptr).max(initial=0) > np.diff(by_columns.indptr).max(initial=0)
     try:
-        factors = scipy.sparse.linalg.splu(sp.csc_array(matrix))
+        factors = scipy.sparse.linalg.splu(by_rows.T if turned else by_columns)
     except RuntimeError:  # exactly singular
         return None
+    way, back = ("T", "N") if turned else ("N", "T")
     x, size = np.random.default_rng(0).normal(size=matrix.shape[0]), 1.0
     with np.errstate(all="ignore"):
         for _ in range(STEPS):  # of the power method for the inverse of AᵀA
-            x = factors.solve(factors.solve(x / np.linalg.norm(x), "T"))
+            x = factors.solve(factors.solve(x / np.linalg.norm(x), back), way)
             size = np.linalg.norm(x)
-    return factors.solve if size < 1 / REGULARIZATION else None
+    return functools.partial(factors.solve, trans=way) if size < 1 / REGULARIZATION else None
