@@ -31,7 +31,7 @@ ROOMY_RECORD = 2**20
 # 256 rows, 25 kB and 19 ms with 64, 14 kB and 17 ms with 32.
 ROWS, ROWS_IN_BATCH = 64, 32
 # The largest states whose stages are a loop where a run is made by itself. What is computed on arrays takes a tenth
-# longer to compile written out (0.2 s), and runs in 0.74 to 0.86 of the time: ladders of 40, 100, 1,000 and 4,000 cells.
+# longer to compile written out (0.2 s), and runs in 0.74 to 0.86 of the time: ladders of 40 to 4,000 cells.
 LOOPED = 32
 
 _forward: contextvars.ContextVar[bool] = contextvars.ContextVar("forward_mode", default=False)

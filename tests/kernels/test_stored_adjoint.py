@@ -373,8 +373,12 @@ def test_parts_of_parameters_are_read_once():
     values = jnp.concatenate([jnp.linspace(0.5, 1.0, n), jnp.linspace(1.0, 3.0, n), jnp.ones(1)])
     mixed = np.random.default_rng(0).permutation(n)
 
+    @jax.jit
+    def along(values, y):
+        return values[:n] * (jnp.append(values[-1], y[:-1]) - y)
+
     def diffusion(t, y, values):
-        flow = values[:n] * (jnp.append(values[-1], y[:-1]) - y)
+        flow = along(values, y)  # functions that are called read, too
         return (flow - jnp.append(flow[1:], 0.0)) / values[n + mixed]
 
     def loss(values, adjoint):
