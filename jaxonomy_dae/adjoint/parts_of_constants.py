@@ -7,9 +7,9 @@ from jax import Array
 
 from ..private_names import MissingName, private
 
-# Entries of an array from which its parts are read before the loop. Fewer are read one by one, together
-# (`lowering.gather.FEW`), and would make as many constants.
-LARGE = 256
+# Entries of an array from which its parts are read before the loop. Of fewer, padding costs little (a step of 100 cells
+# takes as long), while a function that is given the parts is one more in the program.
+LARGE = 1024
 READS = frozenset({"slice", "gather", "dynamic_slice", "squeeze"})
 PER_ARGUMENT = ("in_shardings", "in_layouts", "donated_invars")  # parameters of a call with an entry for each argument
 
@@ -31,7 +31,8 @@ def parts_of_constants(jaxpr: Any, consts: list[Array]) -> tuple[Any, list[Array
     than all else of a step. The derivative of reading is now taken once, outside.
     """
     try:
-        private("Literal"), private("ClosedJaxpr")
+        for name in ("Literal", "ClosedJaxpr"):
+            private(name)
     except MissingName:
         return jaxpr, consts
     value: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))

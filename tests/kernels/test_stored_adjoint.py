@@ -369,7 +369,7 @@ def test_parts_of_parameters_are_read_once():
     """A step's cotangents are as long as what it reads. Each read of a long array inside the step was padded to the
     length of the whole, at every stage: the gradient of a ladder of 4,000 cells by its parameters took 11 times its
     run, and half of this went into pads."""
-    n = 300
+    n = 600
     values = jnp.concatenate([jnp.linspace(0.5, 1.0, n), jnp.linspace(1.0, 3.0, n), jnp.ones(1)])
     mixed = np.random.default_rng(0).permutation(n)
 
