@@ -1,7 +1,6 @@
 """Gradient steps on a loss of one's own, where there are no records to fit: a design, a controller, a policy."""
 
 import dataclasses
-import functools
 import html
 import math
 import numbers
@@ -108,7 +107,7 @@ def minimize(
     # Updates make weakly typed leaves strong, which would compile the step again.
     trainable = jax.tree.map(lambda w: jnp.asarray(w, w.dtype) if eqx.is_array(w) else w, trainable)
 
-    @functools.partial(compiled, runs_once=False)
+    @compiled
     def step(trainable, frozen, state, args):
         def objective(trainable):
             value = loss(_merged(eqx.combine(trainable, frozen)), *args)
