@@ -509,7 +509,10 @@ class Reader:
                 self.pass_annotation()
                 self.need(";")
             elif self._begins_class():
+                begin = self.i
                 inner = self.definition()
+                if inner.name in classes:
+                    self._fail_at(self.places[begin], f"'{name}' defines the class '{inner.name}' twice")
                 classes[inner.name] = inner
             else:
                 declarations += self.declarations()

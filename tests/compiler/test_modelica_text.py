@@ -49,6 +49,12 @@ def test_declarations_keep_what_they_say():
     assert flat.name == "Ball"
 
 
+def test_dimensions_of_a_name_stand_before_those_of_its_type():
+    """`Real[3] x[2]` is `Real x[2, 3]`: two arrays of three."""
+    (x,) = read_base("model m Real[3] x[2]; end m;").declarations
+    assert [d.value for d in x.dimensions] == [2, 3]
+
+
 def test_quoted_names_are_no_keywords_and_comments_are_left_out():
     text = "model m Real 'end' \"a\" + \"b\"; /* no */ Real 'if.then'; equation 'end' = 'if.then'; // no\n end m;"
     model = read_base(text)
@@ -63,6 +69,7 @@ def test_quoted_names_are_no_keywords_and_comments_are_left_out():
         ("model m equation x + 1; end m;", "line 1, column 23", "expected '='"),
         ("", "line 1, column 1", "expected a class"),
         ("model m equation x = (1; end m;", "line 1, column 24", "expected ','"),
+        ("package p model m end m;\n model m end m; end p;", "line 2, column 2", "'p' defines the class 'm' twice"),
     ],
 )
 def test_syntax_errors_say_where(text, where, what):
