@@ -48,6 +48,29 @@ def _(size, batched, values):
 
 
 @jax.custom_jvp
+def once_in_batches(vector: Any) -> Any:
+    """The vector; in a batch it is computed once, and each entry lies together for all members: its readers read
+    entries, and XLA would add these up anew for each of them, across the members."""
+    return _together(vector)
+
+
+@once_in_batches.defjvp
+def _(primals, tangents):
+    return once_in_batches(*primals), *tangents  # JAX has no transpose of a `custom_vmap` function
+
+
+@jax.custom_batching.custom_vmap
+def _together(vector):
+    return vector
+
+
+@_together.def_vmap
+def _(size, batched, vector):
+    del size, batched
+    return joined([vector.T]).T, True
+
+
+@jax.custom_jvp
 def stacked_in_batches(values: list[Any]) -> Any:
     """Scalars as a vector. In a batch each is computed by a loop of its own: XLA would compute all within the one that
     puts them together, anew for each of them and without vector instructions, which took five times as long for
@@ -57,7 +80,7 @@ def stacked_in_batches(values: list[Any]) -> Any:
 
 @stacked_in_batches.defjvp
 def _(primals, tangents):
-    return stacked_in_batches(*primals), jnp.stack(tangents[0])  # JAX has no transpose of a `custom_vmap` function
+    return stacked_in_batches(*primals), jnp.stack(tangents[0])
 
 
 @jax.custom_batching.custom_vmap

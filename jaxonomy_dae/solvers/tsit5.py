@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..linear.once import joined
+from ..linear.once import joined, once_in_batches
 from .field_size import is_large
 from .switching import Watch
 
@@ -69,7 +69,7 @@ class Tsit5(diffrax.Tsit5):
         k, points = [terms.prod(slope, control)], [y0]
         for a, c in zip(tableau.a_lower, tableau.c, strict=True):
             point = y0 + _combine(a, k)
-            points.append(joined([point]) if y0.size > LONG else point)
+            points.append(joined([point]) if y0.size > LONG else once_in_batches(point))
             slope = terms.vf(t0 + float(c) * (t1 - t0), points[-1], args)
             k.append(terms.prod(slope, control))
         return points[-2], points[-1], slope, k
