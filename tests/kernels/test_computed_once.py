@@ -10,7 +10,7 @@ import pytest
 
 from jaxonomy_dae.linear.dense import over
 from jaxonomy_dae.linear.inverse import inverse
-from jaxonomy_dae.linear.once import joined, once, stacked, stacked_in_batches
+from jaxonomy_dae.linear.once import joined, once, once_in_batches, stacked, stacked_in_batches
 from jaxonomy_dae.linear.torn import solve_torn
 from jaxonomy_dae.structure.tearing import Tearing
 
@@ -175,3 +175,20 @@ def test_entries_of_a_vector_in_a_batch():
     moved = (by_hand(x + step) - by_hand(x - step)) / 2
     np.testing.assert_allclose(both @ step, moved, atol=1e-14)
     jax.jit(jax.vmap(jax.hessian(lambda x: field(x) @ given)))(x[:2])  # twice, and in a batch
+
+
+def test_a_vector_in_a_batch():
+    """The point of a stage was added up anew by each of its readers: 10,000 pendulums took 1.2 times as long."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(100, 3)))
+
+    def read(x):
+        point = once_in_batches(2.0 * x)
+        return jnp.sin(point[0]) * point[1] + point[2] ** 2
+
+    program = jax.jit(jax.vmap(jax.value_and_grad(read))).lower(x).compile()
+    a, b, c = 2.0 * np.asarray(x).T
+    value, slopes = program(x)
+    np.testing.assert_allclose(value, np.sin(a) * b + c**2, rtol=1e-14, atol=1e-14)
+    right = 2.0 * np.stack([np.cos(a) * b, np.sin(a), 2 * c], axis=1)
+    np.testing.assert_allclose(slopes, right, rtol=1e-14, atol=1e-14)
+    assert "inlineable" in program.as_text() and "custom" not in jax.jit(read).lower(x[0]).as_text()
