@@ -23,6 +23,7 @@ from jaxtyping import Float
 # For entries near one. What belongs to singular values above its root, 1e-5, is solved; rounding leaves some eps/δ of
 # the residual in directions that A leaves open, which the repetitions take out of b, not out of x.
 REGULARIZATION = 1e-10
+SMALLEST = REGULARIZATION**0.5
 REPETITIONS = 3
 STEPS = 4  # after which a random vector of 10⁵ entries shows a single small singular value to a factor of ten
 
@@ -51,9 +52,9 @@ class SparseLeastSquares:
         return x
 
 
-def regular_factors(matrix: Any) -> Callable[[np.ndarray], np.ndarray] | None:
-    """The solution for right-hand sides, given a square sparse matrix with entries near one; None if the matrix has
-    a singular value that least squares would leave out."""
+def regular_factors(matrix: Any, least: float = SMALLEST) -> Callable[[np.ndarray], np.ndarray] | None:
+    """The solution for right-hand sides, given a square sparse matrix with entries near one; None if it has a singular
+    value below `least`, by default one that least squares would leave out."""
     # SuperLU orders columns, and puts a full one last; a full row, such as that of a node where all of an array meets,
     # would fill the factors: 6.5 GB for 20,000 cells.
     by_rows, by_columns = sp.csr_array(matrix), sp.csc_array(matrix)
@@ -68,4 +69,4 @@ def regular_factors(matrix: Any) -> Callable[[np.ndarray], np.ndarray] | None:
         for _ in range(STEPS):  # of the power method for the inverse of AᵀA
             x = factors.solve(factors.solve(x / np.linalg.norm(x), back), way)
             size = np.linalg.norm(x)
-    return functools.partial(factors.solve, trans=way) if size < 1 / REGULARIZATION else None
+    return functools.partial(factors.solve, trans=way) if size * least**2 < 1 else None

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.sparse import csgraph
 
 from ..judgement.scaling import equilibrated
 from ..linear.sparse_least_squares import SparseLeastSquares, regular_factors
@@ -14,11 +15,12 @@ from ..model.jacobian import residual_and_jacobian
 from ..model.quantities import ReducedModel
 from ..model.tables import Declared
 from ..solvers.solve import SMALL
-from ..tolerances import RANK
+from ..tolerances import KNOWN, RANK
 
 # Dimension of the space in which the largest eigenvalues are sought: of 1,000 heated cells, 10, 20, 40 give the fastest
 # one to 0.6, 0.2, 0.05 %, where decades count.
 KRYLOV = 40
+LAST = 1e4  # a cost above any logarithm of an entry
 HOLDS = 1e3  # weight of the equations in the choice of quantities; from 10 to 1e6 that decay is the same to ten digits
 
 
@@ -87,9 +89,9 @@ def fastest_decay(model: ReducedModel, parameters: np.ndarray) -> float:
     """The largest −Re λ among the eigenvalues λ that decay rather than oscillate, per unit of time; 0 if there are
     none.
 
-    The equations, linearised at a consistent point, leave the quantities q = N c free, with N a basis of the null space
-    of ∂F/∂q. Each quantity v and its derivative obey d(N_v c)/dt = N_v' c, so c' = N_v⁺ N_v' c: the eigenvalues of that
-    matrix are those of the system, whatever its index and its states. Networks count as zero: their weights change.
+    The equations, linearised at a consistent point, leave some quantities v free, and determine all others: v' = A v.
+    The eigenvalues of A are those of the system, whatever its index and its states. Networks count as zero: their
+    weights change.
     """
     quantities = model.extended.quantities
     n = quantities.n_unknown
@@ -106,13 +108,12 @@ def fastest_decay(model: ReducedModel, parameters: np.ndarray) -> float:
 
 
 def _fast_rates(matrix: Any, below: np.ndarray) -> np.ndarray:
-    """The eigenvalues of largest size, by Arnoldi's method: N' N⁺ has those of N⁺ N', and takes v to the derivatives of
-    the quantities nearest to v among those for which the equations hold, linearised."""
+    """The eigenvalues of largest size, by Arnoldi's method, in terms of free quantities among those `below`."""
     scaled, _, unit = equilibrated(matrix)
-    changes, per = _changes(scaled, below), unit[below + 1] / unit[below]
-    steps = min(len(below), KRYLOV)
-    basis, hessenberg = np.zeros((steps + 1, len(below))), np.zeros((steps + 1, steps))
-    basis[0] = np.random.default_rng(0).normal(size=len(below))
+    free, changes = _changes(scaled, below)
+    per, steps = unit[free + 1] / unit[free], min(len(free), KRYLOV)
+    basis, hessenberg = np.zeros((steps + 1, len(free))), np.zeros((steps + 1, steps))
+    basis[0] = np.random.default_rng(0).normal(size=len(free))
     basis[0] /= np.linalg.norm(basis[0])
     for k in range(steps):
         v = changes(basis[k]) * per
@@ -129,21 +130,39 @@ def _fast_rates(matrix: Any, below: np.ndarray) -> np.ndarray:
     return np.linalg.eigvals(found) if np.isfinite(found).all() else np.zeros(0)
 
 
-def _changes(matrix: Any, below: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """From v to the derivatives of the quantities `below` that are nearest to v among those for which the equations
-    hold, given their Jacobian."""
-    n = matrix.shape[1]
-    others = np.delete(np.arange(n), below)
-    solve = regular_factors(matrix[:, others]) if matrix.shape[0] == len(others) else None
-    if solve is not None:  # no equation constrains v
-        given, values = matrix[:, below], np.empty(n)
+def _free(matrix: Any, below: np.ndarray) -> np.ndarray:
+    """Of the quantities `below`, as many as the equations leave free: all, or those that the matching of equations to
+    quantities by large entries of their Jacobian passes over (as weights by Duff & Koster 2001)."""
+    m, n = matrix.shape
+    if m == n - len(below):
+        return below
+    entries = matrix.tocoo()
+    entries.eliminate_zeros()
+    last = np.isin(entries.col, below)  # all others follow
+    costs = sp.csr_array((LAST * (1 + last) - np.log(np.abs(entries.data)), (entries.row, entries.col)), shape=(m, n))
+    return np.setdiff1d(below, csgraph.min_weight_full_bipartite_matching(costs)[1])
+
+
+def _changes(matrix: Any, below: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """(quantities v that can be chosen, from v to their derivatives), given the equations' Jacobian."""
+    m, n = matrix.shape
+    try:
+        free = _free(matrix, below)
+    except ValueError:  # no full matching
+        free = below
+    others = np.delete(np.arange(n), free)
+    # An open switch makes equations nearly singular, which hold all the same.
+    solve = regular_factors(matrix[:, others], KNOWN) if m == len(others) else None
+    if solve is not None:
+        given, values = matrix[:, free], np.empty(n)
 
         def change(v: np.ndarray) -> np.ndarray:
-            values[below], values[others] = v, -solve(given @ v)
-            return values[below + 1]
+            values[free], values[others] = v, -solve(given @ v)
+            return values[free + 1]
 
-        return change
+        return free, change
+    # Equations depend on each other: v is the nearest for which they hold.
     chosen = sp.csr_array((np.ones(len(below)), (np.arange(len(below)), below)), shape=(len(below), n))
     factors = SparseLeastSquares(sp.vstack([HOLDS * matrix, chosen]))
-    zero = np.zeros(matrix.shape[0])
-    return lambda v: factors.solve(np.concatenate([zero, v]))[below + 1]
+    zero = np.zeros(m)
+    return below, lambda v: factors.solve(np.concatenate([zero, v]))[below + 1]
