@@ -146,9 +146,10 @@ def main() -> None:
                         print(row(f"{name}: {label}", found), flush=True)
                         if asked.verbose and "error" not in found:
                             print("   ", found["large"], dict(found["names"]), flush=True)
-                        collected.setdefault(label, []).append(found.get("cpu", float("nan")))
+                        if "cpu" in found:
+                            collected.setdefault(label, []).append(found["cpu"])
     for label, values in collected.items():
-        print(f"median {label}: {median(values):.2f} CPU s, most {max(values):.2f}")
+        print(f"median {label}: {median(values):.2f} CPU s, most {max(values):.2f}, of {len(values)} models")
 
 
 if __name__ == "__main__":
