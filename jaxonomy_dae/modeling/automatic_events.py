@@ -361,15 +361,18 @@ def relations_left_alone(residual: sympy.Expr) -> tuple[Expression, ...]:
 @functools.lru_cache(maxsize=4096)
 def _with_marks(residual: sympy.Expr) -> sympy.Expr:
     """The equation with marks of smoothness on those parts whose branches meet with the same value and slope, as those
-    of q·|q|."""
+    of q·|q|. A jump inside a condition gets none, even if the condition is the same on both sides of it: it may jump
+    onto the border of a relation, where the relation's kind decides."""
     order = _inside_out([residual])
+    conditions = [c for e in order if isinstance(e, sympy.Piecewise) for _, c in _pairs(e)]
+    in_conditions = set(_inside_out([side for c in conditions for r in _sides_of(c) for side in r.args]))
     varying = _varying(order)
     kinks = [e for e in order if e in varying and isinstance(e, (sympy.Piecewise, *KINKED))]
     marks = {}
     for e in kinks:
         alone = not any(inner in kinks for inner in _inside_out([e]) if inner is not e)
         parts = _two_branches(e) if alone else None
-        if parts is None:
+        if parts is None or (e in in_conditions and not _is_continuous(e)):
             continue
         one, other, where = parts
         whole: Expression = residual

@@ -18,6 +18,7 @@ from jaxonomy_dae import (
 )
 from jaxonomy_dae.library import hydraulic as hyd
 from jaxonomy_dae.library import signal as sig
+from jaxonomy_dae.modeling.automatic_events import relations_left_alone
 from jaxonomy_dae.modeling.events import guard_of, has_guard
 from jaxonomy_dae.modeling.symbols import DiscreteSymbol, VariableSymbol
 
@@ -137,3 +138,16 @@ def test_whether_a_condition_has_a_guard_is_known_without_making_it(monkeypatch)
     monkeypatch.setattr(sympy, "Min", None)
     assert [has_guard(c) for c in conditions] == expected
     assert {True, False} == set(expected)
+
+
+def test_a_jump_inside_a_condition_is_an_event():
+    """Kind: a jump that was left alone because it makes no difference, though its values do, at the border of a
+    relation. sign(w − 1) ≥ 1/3 and sign(w − 1) < 1 exclude each other before w = 1 and after it, so that the sign was
+    taken for smooth; its jump onto 1 left the strict relation true, and the branch on."""
+    w = VariableSymbol("c.w")
+    sign = sympy.sign(w - 1)
+    both = sympy.And(sign >= sympy.Rational(1, 3), sign < 1)
+    assert relations_left_alone(w - sympy.Piecewise((1, both), (0, True))) == ()
+    # A kink that does not jump is still left alone there.
+    (left,) = relations_left_alone(w - sympy.Piecewise((1, sympy.Abs(w) >= 1), (0, True)))
+    assert left.args[0] == sympy.Abs(w)
