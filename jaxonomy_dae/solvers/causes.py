@@ -100,7 +100,8 @@ def _escape(here: np.ndarray, y: State, t: float, t1: float, weight: np.ndarray,
     """Says which unknown grows so fast that it becomes infinite before t1; "" if none does."""
     value = np.asarray(y)
     growing = value * here > 0
-    rest = np.where(growing, np.abs(value) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny), np.inf)
+    with np.errstate(over="ignore"):  # what hardly grows needs for ever
+        rest = np.where(growing, np.abs(value) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny), np.inf)
     large = np.abs(value) > 1e4 * np.minimum(weight / np.maximum(np.abs(value), TINY) * 1e6, 1.0)
     k = int(np.argmin(np.where(large, rest, np.inf)))
     if not (large[k] and rest[k] < 1e-3 * (t1 - t)):

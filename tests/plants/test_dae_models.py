@@ -229,7 +229,7 @@ ALSO_BDF = pytest.mark.parametrize("solver", [None, pytest.param(BDF(), marks=sl
 def test_a_model_reports_its_turning_point(folded, solver):
     with pytest.raises(SimulationError) as caught:
         simulate(folded, 6.0, ts=TS, solver=solver)
-    assert str(caught.value) == FOLDED
+    assert without_lines(caught.value) == FOLDED
     found = simulate(folded, 6.0, ts=TS, solver=solver, throw=False)
     assert found.result == diffrax.RESULTS.dt_min_reached
     assert found.stats["solver"] == ("Rodas5P" if solver is None else "BDF")

@@ -365,7 +365,7 @@ def test_a_step_by_its_time():
     observed = jax.jit(lambda t: few().system.observe("step.y", t, jnp.zeros(len(few().system.states))))
     assert (observed(0.4), observed(0.6)) == (0.0, 1.0)
     own = [name for name in few().system.parameters.names if name.startswith(("step.", "lag."))]
-    assert own == ["step.height", "step.offset", "step.start_time", "lag.k", "lag.initial_y", "lag.T"]
+    assert own == ["step.height", "step.start_time", "step.offset", "lag.k", "lag.initial_y", "lag.T"]
 
 
 @pytest.mark.slow
