@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from sympy import Eq, cos, sin
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, AcausalSystem, Component, EqnEnv, der, simulate, solvers
-from jaxonomy_dae.system.solver_choice import implicit_choice
+from jaxonomy_dae.run.system.solver_choice import implicit_choice
 
 from .attack import circuits, pipes
 from .testset import PROBLEMS

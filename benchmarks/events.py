@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, AcausalSystem, Component, EqnEnv, der, pre, reinit, simulate
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 END, MOST = 2.6, 10
 RTOL, ATOL = 1e-8, 1e-10

@@ -20,8 +20,8 @@ import numpy as np
 import sympy
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
-from jaxonomy_dae.programs import machine
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.host import machine
+from jaxonomy_dae.host.cache import PROGRAMS
 
 LAWS = (lambda x: x, sympy.sin, sympy.tanh, lambda x: x**3, lambda x: x / (1 + x**2), lambda x: x * sympy.exp(-x))
 COLUMNS = ("models", "mappings", "rss MB", "programs kept", "CPU s", "wall s", "cleared")

@@ -1,9 +1,9 @@
 """What the modified Newton iteration of BDF would cost as an `optimistix.AbstractRootFinder`.
 
 The same iteration for Robertson's equations with algebraic conservation, once as `lax.while_loop` with a derivative by
-the implicit function theorem, as `solvers/newton.py` has it, and once behind `optimistix.root_find` with its implicit
-adjoint. Prints, forward and for the gradient of a scan over steps: lines of StableHLO, CPU seconds of tracing and of
-compilation, CPU microseconds of a step, and whether the program calls back to the host.
+the implicit function theorem, as `solve/methods/newton.py` has it, and once behind `optimistix.root_find` with its
+implicit adjoint. Prints, forward and for the gradient of a scan over steps: lines of StableHLO, CPU seconds of tracing
+and of compilation, CPU microseconds of a step, and whether the program calls back to the host.
 
     python benchmarks/newton_by_optimistix.py
 """

@@ -27,7 +27,7 @@ import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.signal as signal
 import jaxonomy_dae.library.thermal as thermal
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
-from jaxonomy_dae.modeling import Thermal
+from jaxonomy_dae.write import Thermal
 
 from .switching import bank, ladder
 

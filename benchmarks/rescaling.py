@@ -17,12 +17,12 @@ import numpy as np
 import sympy
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, Interval, NeuralDAEBlock
-from jaxonomy_dae.expressions.to_sympy import write
-from jaxonomy_dae.model.linear_template import LinearTemplate
-from jaxonomy_dae.model.opaque import OpaqueFunction
-from jaxonomy_dae.model.starts import Start
-from jaxonomy_dae.model.tables import EquationGroup, FlatModel
-from jaxonomy_dae.modeling.symbols import TIME_LABEL, ParameterSymbol, VariableSymbol
+from jaxonomy_dae.compile.model.linear_template import LinearTemplate
+from jaxonomy_dae.compile.model.opaque import OpaqueFunction
+from jaxonomy_dae.compile.model.starts import Start
+from jaxonomy_dae.compile.model.tables import EquationGroup, FlatModel
+from jaxonomy_dae.graph.expressions.to_sympy import write
+from jaxonomy_dae.write.symbols import TIME_LABEL, ParameterSymbol, VariableSymbol
 
 NAME = "m"
 SMALLEST, LARGEST = -12, 9  # exponents of ten

@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from jaxonomy_dae.errors.page import ROW, Entry
+from jaxonomy_dae.base.errors.page import ROW, Entry
 
 HEAD = re.compile(r"^\| text \|.*\n\|[-|]+\n", re.M)
 

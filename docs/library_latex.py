@@ -6,7 +6,7 @@ from typing import Any
 import sympy
 from sympy.printing.latex import LatexPrinter
 
-from jaxonomy_dae.modeling.symbols import RelationSymbol, VariableSymbol
+from jaxonomy_dae.write.symbols import RelationSymbol, VariableSymbol
 
 GREEK = {
     "alpha", "beta", "gamma", "delta", "epsilon", "eta", "theta", "kappa", "lambda", "mu", "nu", "xi", "pi", "rho",

@@ -19,10 +19,10 @@ from sympy.printing.str import StrPrinter
 
 import jaxonomy_dae.library
 from jaxonomy_dae import Component, Domain, EqnEnv
-from jaxonomy_dae.modeling.arrays import ComponentArray, PortArray
-from jaxonomy_dae.modeling.events import Assign, EventFlag, Reinit, Sampled, Terminate
-from jaxonomy_dae.modeling.interval import Interval
-from jaxonomy_dae.modeling.symbols import ParameterSymbol, RelationSymbol
+from jaxonomy_dae.write.arrays import ComponentArray, PortArray
+from jaxonomy_dae.write.events import Assign, EventFlag, Reinit, Sampled, Terminate
+from jaxonomy_dae.write.interval import Interval
+from jaxonomy_dae.write.symbols import ParameterSymbol, RelationSymbol
 
 # Of components that need more than an environment and a name.
 BATTERY = {"soc": [0.0, 0.5, 1.0], "ocv": [3.0, 3.7, 4.2]}

@@ -5,10 +5,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jax import Array
 
-from .errors import ModelError
-from .optional import QUANTITIES, Axes, axis_label, legend_beside, new_axes, optional_module, pyplot
-from .simulation.labelled import ByName
-from .system.system import AcausalSystem
+from .base.errors import ModelError
+from .base.optional import QUANTITIES, Axes, axis_label, legend_beside, new_axes, optional_module, pyplot
+from .run.simulation.labelled import ByName
+from .run.system.system import AcausalSystem
 
 SEPARATE = 12  # entries of an array that get a colour each
 NAMED = 40  # up to this many unknowns, rows and columns are labelled
@@ -305,7 +305,7 @@ def _arrow(pair: tuple[str, str]) -> str:
 
 
 def _equation_label(plan: Any, equation: int) -> str:
-    from .model.tables import provenance_of
+    from .compile.model.tables import provenance_of
 
     text = str(provenance_of(plan.model.groups, int(plan.extended.base[equation]))).replace("0 = ", "")
     text = text if len(text) <= 40 else text[:39] + "…"

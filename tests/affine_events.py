@@ -13,15 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxonomy_dae.adjoint.ends import ending
-from jaxonomy_dae.adjoint.late_times import Integration
-from jaxonomy_dae.hybrid.control import AtEvents
-from jaxonomy_dae.hybrid.facts import EventFacts
-from jaxonomy_dae.hybrid.problem import AbstractHybridProblem, HybridTerm
-from jaxonomy_dae.hybrid.solver import WithEvents
-from jaxonomy_dae.hybrid.start import start
-from jaxonomy_dae.modeling.events import NO_FLAG, EventFlag
-from jaxonomy_dae.solvers.drive import integrate
+from jaxonomy_dae.solve.adjoint.ends import ending
+from jaxonomy_dae.solve.adjoint.late_times import Integration
+from jaxonomy_dae.solve.events.control import AtEvents
+from jaxonomy_dae.solve.events.facts import EventFacts
+from jaxonomy_dae.solve.events.problem import AbstractHybridProblem, HybridTerm
+from jaxonomy_dae.solve.events.solver import WithEvents
+from jaxonomy_dae.solve.events.start import start
+from jaxonomy_dae.solve.methods.drive import integrate
+from jaxonomy_dae.write.events import NO_FLAG, EventFlag
 
 STATES, DISCRETES, CLOCKS = 4, 4, 3
 ORDINARY, ENDING, IMMEDIATE = 3, 3, 4  # how many guards have no property; the places of the two that have one

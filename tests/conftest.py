@@ -90,7 +90,7 @@ def room_for_compiled_programs():
     if not MAPPINGS.exists():
         return
     if _resident() > _after_clearing + _share_of_memory() or MAPPINGS.read_bytes().count(b"\n") > MOST_MAPPINGS:
-        from jaxonomy_dae.programs.cache import PROGRAMS
+        from jaxonomy_dae.host.cache import PROGRAMS
 
         PROGRAMS.clear()  # otherwise what they hold stays above the limit, and every later test clears again
         jax.clear_caches()

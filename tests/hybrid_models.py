@@ -14,7 +14,7 @@ from jaxonomy_dae import (
     reinit,
     terminate,
 )
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 
 def compiled(component: type, name: str, **arguments) -> AcausalSystem:

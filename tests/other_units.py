@@ -10,9 +10,9 @@ from attack.judge import read
 from rescaling import KINDS, new_name, rescaled
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, AcausalSystem, EqnEnv
-from jaxonomy_dae.compiler.flatten import flatten
+from jaxonomy_dae.compile.model.tables import FlatModel
+from jaxonomy_dae.compile.passes.flatten import flatten
 from jaxonomy_dae.errors import InitializationError, ModelError, StructuralError
-from jaxonomy_dae.model.tables import FlatModel
 
 # What a value may be off by, relative to the largest of its unit; slopes, relative to the fastest.
 TOLERANCE = 1e-9

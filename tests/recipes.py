@@ -14,7 +14,7 @@ from jaxonomy_dae.library.electrical import Capacitor, CurrentSource, Ground, In
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.thermal import FixedTemperature, HeatCapacitor, ThermalConductor
 from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Rod, Spring
-from jaxonomy_dae.modeling import Electrical
+from jaxonomy_dae.write import Electrical
 
 # Classes of each domain with their parameter and the arguments that fix a start.
 DOMAINS = {

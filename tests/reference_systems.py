@@ -12,7 +12,7 @@ import scipy.integrate
 from scipy.linalg import expm
 
 from jaxonomy_dae import AcausalSystem, simulate
-from jaxonomy_dae.simulation.energy_balance import energy_balance
+from jaxonomy_dae.run.simulation.energy_balance import energy_balance
 from jaxonomy_dae.solvers import Rodas5P
 from jaxonomy_dae.testing import assert_energy_balance
 

@@ -14,9 +14,9 @@ import numpy as np
 from reference_systems import ReferenceSystem, integrated, system_of, values_of
 
 from jaxonomy_dae import AcausalSystem, Solution
-from jaxonomy_dae.model.consistent_point import initial_point
-from jaxonomy_dae.model.tables import Declared
-from jaxonomy_dae.system.inputs import read_inputs
+from jaxonomy_dae.compile.model.consistent_point import initial_point
+from jaxonomy_dae.compile.model.tables import Declared
+from jaxonomy_dae.run.system.inputs import read_inputs
 
 ASIDE = 1e-12  # of a run's length: as near to an edge as the field is evaluated, beside its jump
 POINTS = 15  # of Gauss's quadrature in each panel

@@ -19,7 +19,7 @@ import sympy
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, AcausalSystem, Component, EqnEnv, der
 from jaxonomy_dae.errors import InitializationError, ModelError
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 from .judge import CHEAP
 from .outcome import Outcome

@@ -8,7 +8,7 @@ import sympy
 
 from jaxonomy_dae import Component, EqnEnv
 from jaxonomy_dae.library.electrical import Capacitor, CurrentSource, Ground, Inductor, Resistor, VoltageSource
-from jaxonomy_dae.modeling import Electrical
+from jaxonomy_dae.write import Electrical
 
 from .case import UNCHANGED, Case, log_uniform, names, signed
 from .linear_network import ORDER, LinearNetwork

@@ -7,7 +7,7 @@ from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv
 from jaxonomy_dae.library.rotational import Damper, FixedAngle, IdealGear, Inertia, Spring
-from jaxonomy_dae.modeling import Rotational
+from jaxonomy_dae.write import Rotational
 
 from .case import UNCHANGED, Case, log_uniform, names, signed
 from .linear_network import LinearNetwork

@@ -16,7 +16,7 @@ import scipy.integrate
 from sympy import sin
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, NeuralDAEBlock, der
-from jaxonomy_dae.compiler.flatten import flatten
+from jaxonomy_dae.compile.passes.flatten import flatten
 from jaxonomy_dae.library.planar import PlanarPendulum
 
 from .case import Case, Expected, Motion, Slopes, signed

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxonomy_dae import AcausalCompiler, AcausalSystem, simulate
 from jaxonomy_dae.errors import InitializationError, ModelError, SimulationError
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.host.cache import PROGRAMS
 
 from .case import Case, Expected, Motion, Slopes, Variant
 from .outcome import Outcome

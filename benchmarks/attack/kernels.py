@@ -31,13 +31,13 @@ class Verdict:
 
 def verdict(diagram, mode: str = "auto") -> Verdict:
     """What the compiler, or else the examination of blocks at the start, says of a model; in NumPy alone."""
-    from jaxonomy_dae.compiler.flatten import flatten
-    from jaxonomy_dae.compiler.pipeline import compile_flat
+    from jaxonomy_dae.compile.lowering.lower import lower
+    from jaxonomy_dae.compile.model.consistent_point import initial_point
+    from jaxonomy_dae.compile.model.declared import start_guess
+    from jaxonomy_dae.compile.passes.flatten import flatten
+    from jaxonomy_dae.compile.passes.pipeline import compile_flat
     from jaxonomy_dae.errors import ModelError
-    from jaxonomy_dae.initialization.singular_blocks import examine_blocks
-    from jaxonomy_dae.lowering.lower import lower
-    from jaxonomy_dae.model.consistent_point import initial_point
-    from jaxonomy_dae.model.declared import start_guess
+    from jaxonomy_dae.run.start.singular_blocks import examine_blocks
 
     flat = flatten(diagram)
     try:

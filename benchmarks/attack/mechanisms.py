@@ -6,7 +6,7 @@ import numpy as np
 from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv, der
-from jaxonomy_dae.modeling import Domain
+from jaxonomy_dae.write import Domain
 
 from .case import ROUNDING, TOLERANCE, Case, Expected, diagram_of, log_uniform, names
 

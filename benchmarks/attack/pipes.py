@@ -8,7 +8,7 @@ import numpy as np
 import sympy
 
 from jaxonomy_dae import Component, EqnEnv, der
-from jaxonomy_dae.modeling import Domain
+from jaxonomy_dae.write import Domain
 
 from .case import TOLERANCE, Case, Expected, diagram_of, log_uniform, names, signed
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxonomy_dae.compiler.flatten import flatten
+from jaxonomy_dae.compile.passes.flatten import flatten
 
 from .case import Case, Expected
 

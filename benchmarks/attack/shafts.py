@@ -11,7 +11,7 @@ from sympy import Piecewise
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, Rotational, der
 from jaxonomy_dae.library import rotational, signal
 from jaxonomy_dae.library.friction import Brake, Clutch
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 from .case import Case, Variant, diagram_of, drawn, log_uniform, names, numbers_of, varied
 from .drives import motion_of

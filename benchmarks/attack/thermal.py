@@ -7,7 +7,7 @@ from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv
 from jaxonomy_dae.library.thermal import FixedTemperature, HeatCapacitor, ThermalConductor
-from jaxonomy_dae.modeling import Thermal
+from jaxonomy_dae.write import Thermal
 
 from .case import UNCHANGED, Case, log_uniform, names, signed
 from .linear_network import LinearNetwork

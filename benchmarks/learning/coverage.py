@@ -13,7 +13,7 @@ import scipy.integrate
 from sympy import sqrt
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 
 class Battery(Component):

@@ -19,7 +19,7 @@ import numpy as np
 from silent import silent_network
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 SENSOR = 0.0125 / np.sqrt(12)  # °C: the record has steps of 0.0125
 AHEAD, SPLITS = 120, (312, 432, 552)

@@ -22,7 +22,7 @@ from silent import silent_network
 from sympy import Max, sqrt
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 # Levels in volts of the sensor, which ends at 10 V; the upper tank's in units in which its rim is at 10 too. Seconds.
 VALUES = {"pump": 0.05, "a1": 0.04, "b1": 1e-3, "ratio": 0.7, "a2": 0.04, "b2": 1e-3, "share": 0.7}

@@ -17,16 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..aliases import Args, Time
-from ..initialization.ladder import FAILED, find_root, looking
-from ..initialization.problem import frozen_inputs
-from ..initialization.sizes import Sizes
-from ..linear.dense import least_squares
-from ..lowering.plan import SystemPlan
-from ..model.declared import declared_scale, quantity_bounds
-from ..programs.cache import compiled
-from ..system.system import AcausalSystem
-from ..tolerances import AT_REST, ZERO_WITHIN, spacing
+from ..base.aliases import Args, Time
+from ..base.tolerances import AT_REST, ZERO_WITHIN, spacing
+from ..compile.lowering.plan import SystemPlan
+from ..compile.model.declared import declared_scale, quantity_bounds
+from ..host.cache import compiled
+from ..run.start.ladder import FAILED, find_root, looking
+from ..run.start.problem import frozen_inputs
+from ..run.start.sizes import Sizes
+from ..run.system.system import AcausalSystem
+from ..solve.linear.dense import least_squares
 from .events_at_rest import left_by_ticks, recomputed, resting_events
 from .settled_modes import Point, Root, settle
 from .transient import pseudo_transient

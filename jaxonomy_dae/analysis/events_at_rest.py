@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..aliases import Args, Numeric, Time
-from ..lowering.plan import SystemPlan
-from ..model.declared import declared_scale
-from ..modeling.events import EventFlag
-from ..system.system import AcausalSystem
-from ..tolerances import solved
+from ..base.aliases import Args, Numeric, Time
+from ..base.tolerances import solved
+from ..compile.lowering.plan import SystemPlan
+from ..compile.model.declared import declared_scale
+from ..run.system.system import AcausalSystem
+from ..write.events import EventFlag
 
 # Sets of modes that are tried where the equations of the first have no equilibrium: all of six pairs of which one side
 # is zero, or any one of 127. Each costs a search of its own.

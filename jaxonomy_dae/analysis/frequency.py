@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from ..aliases import Time
-from ..errors import explained_keywords
-from ..system.system import AcausalSystem
+from ..base.aliases import Time
+from ..base.errors import explained_keywords
+from ..run.system.system import AcausalSystem
 from .linearize import linearize
 from .operating_point import OperatingPoint
 from .response import FrequencyResponse

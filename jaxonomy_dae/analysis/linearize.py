@@ -9,13 +9,13 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..aliases import Time
-from ..diagnosis.wording import some
-from ..errors import ModelError, explained_keywords, nearest
-from ..programs.staging import is_staged
-from ..system.input_values import by_entry
-from ..system.inputs import read_inputs, value_at
-from ..system.system import AcausalSystem
+from ..base.aliases import Time
+from ..base.errors import ModelError, explained_keywords, nearest
+from ..compile.diagnosis.wording import some
+from ..host.staging import is_staged
+from ..run.system.input_values import by_entry
+from ..run.system.inputs import read_inputs, value_at
+from ..run.system.system import AcausalSystem
 from .events_at_rest import resting_events
 from .operating_point import OperatingPoint
 from .partials import Driven, Partials, compiled_partials, on_tangent, partials_at

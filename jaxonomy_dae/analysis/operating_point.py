@@ -10,8 +10,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..errors import ModelError
-from ..system.system import AcausalSystem
+from ..base.errors import ModelError
+from ..run.system.system import AcausalSystem
 
 SHOWN = 8  # states in the text of a point
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..aliases import Args
-from ..lowering.plan import SystemPlan
-from ..programs.cache import compiled
-from ..system.nonlinear import Refinement
-from ..system.system import AcausalSystem
-from ..tolerances import spacing
+from ..base.aliases import Args
+from ..base.tolerances import spacing
+from ..compile.lowering.plan import SystemPlan
+from ..host.cache import compiled
+from ..run.system.nonlinear import Refinement
+from ..run.system.system import AcausalSystem
 from .events_at_rest import both_sides, resting_events
 from .tangent import Coordinates
 

@@ -5,9 +5,9 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Complex, Float
 
-from ..diagnosis.wording import counted
-from ..errors import ModelError, nearest
-from ..optional import Axes
+from ..base.errors import ModelError, nearest
+from ..base.optional import Axes
+from ..compile.diagnosis.wording import counted
 
 
 class FrequencyResponse(eqx.Module):

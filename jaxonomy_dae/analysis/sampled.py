@@ -16,12 +16,12 @@ from jax import Array
 from jax.core import Tracer
 from jax.typing import DTypeLike
 
-from ..aliases import PyTree
-from ..diagnosis.wording import some
-from ..errors import ModelError
-from ..system.system import AcausalSystem
-from ..system.system_at import SystemAt
-from ..tolerances import KNOWN_ROUNDINGS, MEANT_EQUAL, spacing
+from ..base.aliases import PyTree
+from ..base.errors import ModelError
+from ..base.tolerances import KNOWN_ROUNDINGS, MEANT_EQUAL, spacing
+from ..compile.diagnosis.wording import some
+from ..run.system.system import AcausalSystem
+from ..run.system.system_at import SystemAt
 from .events_at_rest import RestingEvents, resting_events, ticked
 from .partials import Driven, Partials, on_tangent
 from .state_space import StateSpace

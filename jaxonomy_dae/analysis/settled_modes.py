@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..aliases import Args, Time
-from ..system.system import AcausalSystem
-from ..tolerances import solved
+from ..base.aliases import Args, Time
+from ..base.tolerances import solved
+from ..run.system.system import AcausalSystem
 from .events_at_rest import RestingEvents, after_event, next_event
 
 # Equilibria that are tried from one set of modes, and as many for each event: independent modes need one search each.

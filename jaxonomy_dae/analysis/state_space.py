@@ -10,9 +10,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Complex, Float
 
-from ..diagnosis.wording import counted
-from ..errors import ModelError
-from ..optional import optional_module
+from ..base.errors import ModelError
+from ..base.optional import optional_module
+from ..compile.diagnosis.wording import counted
 from .response import FrequencyResponse
 
 SHOWN = 6  # rows and columns of matrices that are printed

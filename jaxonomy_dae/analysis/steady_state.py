@@ -10,15 +10,15 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from ..aliases import Args, PyTree, Time
-from ..diagnosis.wording import some
-from ..errors import ModelError, SteadyStateError, explained_keywords, nearest
-from ..initialization.check import check
-from ..initialization.initialize import find_initial
-from ..programs.staging import is_staged
-from ..solvers.rows import not_a_number
-from ..system.inputs import read_inputs
-from ..system.system import AcausalSystem
+from ..base.aliases import Args, PyTree, Time
+from ..base.errors import ModelError, SteadyStateError, explained_keywords, nearest
+from ..compile.diagnosis.wording import some
+from ..host.staging import is_staged
+from ..run.start.check import check
+from ..run.start.initialize import find_initial
+from ..run.system.inputs import read_inputs
+from ..run.system.system import AcausalSystem
+from ..solve.methods.rows import not_a_number
 from .equilibrium import Equilibrium, compiled_search, find_equilibrium, is_open, open_directions, unknowns
 from .events_at_rest import resting_events
 from .operating_point import OperatingPoint

@@ -13,14 +13,14 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from ..aliases import PyTree
-from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
-from ..optional import optional_module
-from ..programs.cache import compiled
-from ..simulation.labelled import dataset_of
-from ..simulation.simulate import simulate
-from ..simulation.solution import Solution
-from ..system.system import AcausalSystem
+from ..base.aliases import PyTree
+from ..base.errors import InitializationError, ModelError, SimulationError, SteadyStateError
+from ..base.optional import optional_module
+from ..host.cache import compiled
+from ..run.simulation.labelled import dataset_of
+from ..run.simulation.simulate import simulate
+from ..run.simulation.solution import Solution
+from ..run.system.system import AcausalSystem
 from .steady_state import check_system
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..tolerances import RANK
+from ..base.tolerances import RANK
 
 ALIKE = 0.5  # of the largest pivot: what counts as equally good, so that rounding decides nothing
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..linear.dense import least_squares
+from ..solve.linear.dense import least_squares
 
 STEPS = 200  # from a hundredth of the fastest time constant, three times as long each, they pass thirty decades
 LONGER, SHORTER = 3.0, 0.25

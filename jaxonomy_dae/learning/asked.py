@@ -5,10 +5,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..diagnosis.unused_parameters import unused_parameters
-from ..errors import ModelError, nearest
-from ..model.tables import ZERO
-from ..system.system import AcausalSystem
+from ..base.errors import ModelError, nearest
+from ..compile.diagnosis.unused_parameters import unused_parameters
+from ..compile.model.tables import ZERO
+from ..run.system.system import AcausalSystem
 from .coordinates import Coordinates
 from .filtering import Filter, Innovations, check_model
 from .multiple_shooting import Shooting

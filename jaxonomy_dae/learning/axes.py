@@ -5,8 +5,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..errors import ModelError, nearest
-from ..optional import Axes, pyplot
+from ..base.errors import ModelError, nearest
+from ..base.optional import Axes, pyplot
 
 AxesGiven: TypeAlias = Axes | Sequence[Axes] | np.ndarray | None  # an array of axes, or None: new ones
 

@@ -10,10 +10,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from ..errors import ModelError, nearest
-from ..model.opaque import OpaqueFunction
-from ..optional import Axes, new_axes
-from ..programs.cache import compiled
+from ..base.errors import ModelError, nearest
+from ..base.optional import Axes, new_axes
+from ..compile.model.opaque import OpaqueFunction
+from ..host.cache import compiled
 from .blocks import block_of
 from .program import weights_of, with_weights
 from .runs import run

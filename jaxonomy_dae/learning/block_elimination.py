@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..programs.threads import one_thread
+from ..host.threads import one_thread
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from ..lowering.plan import SystemPlan
-from ..model.opaque import OpaqueFunction, OpaqueTemplate
+from ..compile.lowering.plan import SystemPlan
+from ..compile.model.opaque import OpaqueFunction, OpaqueTemplate
 
 
 @dataclasses.dataclass(frozen=True)

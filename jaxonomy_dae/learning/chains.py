@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..errors import SimulationError
-from ..optional import optional_module
-from ..programs.cache import compiled
+from ..base.errors import SimulationError
+from ..base.optional import optional_module
+from ..host.cache import compiled
 from .density import Posed, Program, density, density_and_gradient
 
 Begun: TypeAlias = tuple[Float[Array, " u"], Float[Array, ""], Float[Array, " u"]]  # a point, ln p, its gradient

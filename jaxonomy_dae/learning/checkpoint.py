@@ -18,8 +18,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..aliases import PyTree
-from ..errors import ModelError
+from ..base.aliases import PyTree
+from ..base.errors import ModelError
 
 KIND = "jaxonomy_dae training"
 Described: TypeAlias = "str | float | None | Sequence[Described]"  # what JSON keeps

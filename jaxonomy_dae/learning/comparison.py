@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, nearest, whole_number
+from ..base.errors import ModelError, nearest, whole_number
 from .data import Data
 from .estimate import Estimate
 from .problem import Problem

@@ -19,10 +19,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..aliases import PyTree
-from ..errors import ModelError, nearest
-from ..modeling.interval import Interval, closed_ends
-from ..system.parameters import ParameterNames
+from ..base.aliases import PyTree
+from ..base.errors import ModelError, nearest
+from ..run.system.parameters import ParameterNames
+from ..write.interval import Interval, closed_ends
 from .data import Stacked
 from .experiment import Unknown
 from .priors import LogNormal, Normal, Prior

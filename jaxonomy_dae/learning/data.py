@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..errors import ModelError, nearest
-from ..lowering.plan import SystemPlan
-from ..system.inputs import KINDS
+from ..base.errors import ModelError, nearest
+from ..compile.lowering.plan import SystemPlan
+from ..run.system.inputs import KINDS
 from .axes import LEGEND, AxesGiven, chosen_names, grid_of_axes
 from .experiment import Experiment, Unknown, check_increasing
 from .noise import Noise

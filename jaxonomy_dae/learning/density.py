@@ -26,8 +26,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from ..errors import ModelError
-from ..programs.cache import compiled
+from ..base.errors import ModelError
+from ..host.cache import compiled
 from .coordinates import Shifts
 from .devices import each, each_with_slopes
 from .factors import Factors

@@ -24,7 +24,7 @@ import scipy.linalg
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from ..errors import InitializationError, ModelError, SimulationError, nearest, whole_number
+from ..base.errors import InitializationError, ModelError, SimulationError, nearest, whole_number
 from .coordinates import Coordinates
 from .data import Stacked
 from .estimate import Estimate

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from ..errors import ModelError, SimulationError
+from ..base.errors import ModelError, SimulationError
 from .design import informations, known_of
 from .estimate import Estimate
 from .experiment import Planned

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
-from ..aliases import PyTree
-from ..errors import ModelError
+from ..base.aliases import PyTree
+from ..base.errors import ModelError
 
 Found = TypeVar("Found", bound=PyTree)
 # A function of numbers that experiments share, those of one experiment, and its conditions.

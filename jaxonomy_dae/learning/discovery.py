@@ -31,9 +31,9 @@ import scipy.stats
 import sympy
 from jaxtyping import Array, Float
 
-from ..errors import ModelError, SimulationError, nearest, whole_number
-from ..programs.cache import compiled
-from ..system.system import AcausalSystem
+from ..base.errors import ModelError, SimulationError, nearest, whole_number
+from ..host.cache import compiled
+from ..run.system.system import AcausalSystem
 from .blocks import Block, block_of
 from .libraries import Library
 from .table import Row, Table

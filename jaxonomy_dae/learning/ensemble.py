@@ -12,10 +12,10 @@ import scipy.stats
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..aliases import PyTree
-from ..errors import ModelError, SimulationError, nearest, whole_number
-from ..simulation.solution import Solution
-from ..system.system import AcausalSystem
+from ..base.aliases import PyTree
+from ..base.errors import ModelError, SimulationError, nearest, whole_number
+from ..run.simulation.solution import Solution
+from ..run.system.system import AcausalSystem
 from .band import Band
 from .estimate import Estimate
 from .prediction import Prediction

@@ -9,9 +9,9 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from ..errors import ModelError, nearest
-from ..optional import Axes
-from ..system.system import AcausalSystem
+from ..base.errors import ModelError, nearest
+from ..base.optional import Axes
+from ..run.system.system import AcausalSystem
 from .agreement import Whiteness, correlated, log_likelihood, rms_by_name, whiteness
 from .axes import AxesGiven
 from .band import Band, band, explored

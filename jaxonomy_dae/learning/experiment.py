@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from jax.typing import ArrayLike
 
-from ..errors import ModelError, nearest, whole_number
-from ..lowering.plan import SystemPlan
+from ..base.errors import ModelError, nearest, whole_number
+from ..compile.lowering.plan import SystemPlan
 from .noise import ESTIMATE, Noise
 from .priors import is_finite
 from .records import interpolated, low_pass, smoothed, untrended

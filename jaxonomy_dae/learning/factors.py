@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Bool, Float
 
-from ..programs.threads import one_thread
+from ..host.threads import one_thread
 
 
 @dataclasses.dataclass(frozen=True)

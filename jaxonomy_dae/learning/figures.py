@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import ModelError
-from ..optional import Axes, axis_label, legend_beside, new_axes
+from ..base.errors import ModelError
+from ..base.optional import Axes, axis_label, legend_beside, new_axes
 from .axes import LEGEND, AxesGiven, chosen_names, grid_of_axes
 from .descent import Minimum
 from .objective import Objective

@@ -6,7 +6,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
-from ..system.system import AcausalSystem
+from ..run.system.system import AcausalSystem
 from .data import Stacked
 from .experiment import Unknown
 from .filtering import Structure

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..programs.cache import compiled
-from ..system.system import AcausalSystem
+from ..host.cache import compiled
+from ..run.system.system import AcausalSystem
 from .data import Stacked
 from .filter_data import Told, told_of
 from .filter_steps import corrected_by, model_of, moved_by, onwards, read, read_values, start_of

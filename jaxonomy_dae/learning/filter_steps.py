@@ -20,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..simulation.simulate import simulate
-from ..simulation.solution import Solution
-from ..system.input_values import by_entry
-from ..system.inputs import read_inputs, value_at
-from ..system.nonlinear import Refinement
-from ..system.system import AcausalSystem
-from ..system.system_at import SystemAt
+from ..run.simulation.simulate import simulate
+from ..run.simulation.solution import Solution
+from ..run.system.input_values import by_entry
+from ..run.system.inputs import read_inputs, value_at
+from ..run.system.nonlinear import Refinement
+from ..run.system.system import AcausalSystem
+from ..run.system.system_at import SystemAt
 from .filter_data import Told
 from .filtering import Structure
 from .linear_models import affine_flow, linear_flow

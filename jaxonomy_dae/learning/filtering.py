@@ -11,8 +11,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..errors import ModelError, nearest, whole_number
-from ..system.system import AcausalSystem
+from ..base.errors import ModelError, nearest, whole_number
+from ..run.system.system import AcausalSystem
 from .coordinates import Coordinate
 from .data import Stacked
 from .experiment import ESTIMATE, Unknown

@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..optional import Axes, new_axes
+from ..base.optional import Axes, new_axes
 from .evaluation import Evaluation, Weights
 from .factors import Factors
 from .objective import Objective

@@ -8,9 +8,9 @@ from typing import Any, TypeAlias
 import sympy
 from jax.typing import ArrayLike
 
-from ..errors import ModelError, nearest
-from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
-from ..modeling.networks import count_outputs, of_scalars
+from ..base.errors import ModelError, nearest
+from ..graph.expressions.from_sympy import UnsupportedExpression, read, symbols_of
+from ..write.networks import count_outputs, of_scalars
 from .term import AbstractTerm, Inner, OfFunction, Power, Written, inner_of, local_name
 
 Text: TypeAlias = str | sympy.Expr | float

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..aliases import Numeric
-from ..system.system import AcausalSystem
+from ..base.aliases import Numeric
+from ..run.system.system import AcausalSystem
 
 SMALL = 0.25  # of ‖A h‖, where the series begins
 TERMS = 12  # of the series, which leave a remainder below rounding there: (2·¼)¹³/14! = 1e-15

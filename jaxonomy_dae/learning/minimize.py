@@ -15,15 +15,15 @@ import numpy as np
 import optax
 from tqdm import tqdm
 
-from ..aliases import Numeric, PyTree
-from ..diagnosis.unused_parameters import unused_parameters
-from ..diagnosis.wording import listed
-from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError, explained_keywords
-from ..modeling.interval import Interval
-from ..programs.cache import compiled
-from ..programs.staging import is_traced
-from ..system.bounds import project
-from ..system.system import AcausalSystem
+from ..base.aliases import Numeric, PyTree
+from ..base.errors import InitializationError, ModelError, SimulationError, SteadyStateError, explained_keywords
+from ..compile.diagnosis.unused_parameters import unused_parameters
+from ..compile.diagnosis.wording import listed
+from ..host.cache import compiled
+from ..host.staging import is_traced
+from ..run.system.bounds import project
+from ..run.system.system import AcausalSystem
+from ..write.interval import Interval
 
 Model = TypeVar("Model", bound=eqx.Module)
 

@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .block_elimination import Blocks, eliminate, linear
 from .descent import FIRST, OFFSET, PATIENCE, SETTLED, TRIALS, Minimum, can_move, damping_after, offset
 from .evaluation import Weights

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..lowering.plan import SystemPlan
+from ..compile.lowering.plan import SystemPlan
 from .segments import Segments
 
 FEWEST = 5  # samples to smooth: two more than a parabola has coefficients

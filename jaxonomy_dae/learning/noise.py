@@ -14,7 +14,7 @@ import scipy.special
 import scipy.stats
 from jaxtyping import Bool, Float
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .priors import is_finite
 
 ESTIMATE = "estimate"

@@ -17,8 +17,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 from scipy.special import chdtrc
 
-from ..aliases import PyTree
-from ..system.system import AcausalSystem
+from ..base.aliases import PyTree
+from ..run.system.system import AcausalSystem
 from .blocks import Block, block_of
 from .coordinates import Coordinates
 from .data import Stacked

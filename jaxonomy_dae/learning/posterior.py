@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..diagnosis.wording import quoted
-from ..errors import ModelError, nearest, whole_number
-from ..programs.cache import compiled
+from ..base.errors import ModelError, nearest, whole_number
+from ..compile.diagnosis.wording import quoted
+from ..host.cache import compiled
 from .band import Band, law_of, law_values
 from .chains import begin, blackjax, chain
 from .density import coordinates_at, posed

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import ModelError, nearest
+from ..base.errors import ModelError, nearest
 from .axes import AxesGiven, chosen_names, grid_of_axes
 from .objective import Objective, Predicted
 from .program import Conditions, predict_and_differentiate

@@ -11,8 +11,8 @@ from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 
-from ..errors import ModelError, nearest
-from ..system.parameters import ParameterNames
+from ..base.errors import ModelError, nearest
+from ..run.system.parameters import ParameterNames
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..errors import ModelError, SimulationError, explained_keywords
-from ..solvers.solve import check_tolerances, default_tolerances
-from ..system.system import AcausalSystem
+from ..base.errors import ModelError, SimulationError, explained_keywords
+from ..run.system.system import AcausalSystem
+from ..solve.methods.solve import check_tolerances, default_tolerances
 from .asked import METHODS, as_asked, check_start, checked_method, names_to_train, penalties, started
 from .beginnings import beginning, silent
 from .coordinates import Coordinate, Coordinates, coordinates

@@ -26,12 +26,12 @@ from jax.sharding import Mesh
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, Int
 
-from ..aliases import PyTree
-from ..errors import ModelError
-from ..programs.cache import compiled
-from ..simulation.simulate import simulate
-from ..simulation.solution import Solution
-from ..system.system import AcausalSystem
+from ..base.aliases import PyTree
+from ..base.errors import ModelError
+from ..host.cache import compiled
+from ..run.simulation.simulate import simulate
+from ..run.simulation.solution import Solution
+from ..run.system.system import AcausalSystem
 from .data import Stacked
 from .devices import each, each_with_slopes
 

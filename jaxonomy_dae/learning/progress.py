@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 
 RECENT = 4  # steps by which the rest is extrapolated
 

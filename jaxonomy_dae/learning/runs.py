@@ -9,11 +9,11 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..aliases import PyTree
-from ..errors import InitializationError, ModelError, SimulationError, nearest
-from ..simulation.simulate import simulate
-from ..simulation.solution import Solution
-from ..system.system import AcausalSystem
+from ..base.aliases import PyTree
+from ..base.errors import InitializationError, ModelError, SimulationError, nearest
+from ..run.simulation.simulate import simulate
+from ..run.simulation.solution import Solution
+from ..run.system.system import AcausalSystem
 from .objective import Objective
 from .program import Runs, SensorLaw, Setting, placed, predict, run_end
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..programs.cache import compiled
-from ..simulation.simulate import simulate
+from ..host.cache import compiled
+from ..run.simulation.simulate import simulate
 from .devices import each, each_with_slopes
 from .program import Conditions, Inputs, Owns, Setting, Shared, outputs_of, placed, run_end, with_kinds
 

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .filter_data import Told
 from .filter_program import Ahead, Track, go_on, read_states
 from .objective import Objective

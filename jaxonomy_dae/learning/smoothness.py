@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..model.opaque import OpaqueFunction
-from ..programs.cache import compiled
+from ..compile.model.opaque import OpaqueFunction
+from ..host.cache import compiled
 from .coordinates import Coordinates
 from .program import with_weights
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..optional import Axes, new_axes
+from ..base.optional import Axes, new_axes
 
 
 @dataclasses.dataclass(frozen=True)

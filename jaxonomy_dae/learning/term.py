@@ -16,10 +16,10 @@ import sympy
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..aliases import Expression, Numeric
-from ..expressions.from_sympy import read
-from ..expressions.kernel import Kernel
-from ..model.opaque import AbstractReplacement
+from ..base.aliases import Expression, Numeric
+from ..compile.model.opaque import AbstractReplacement
+from ..graph.expressions.from_sympy import read
+from ..graph.expressions.kernel import Kernel
 
 
 @dataclasses.dataclass(frozen=True)

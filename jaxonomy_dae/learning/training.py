@@ -12,9 +12,9 @@ import numpy as np
 import optax
 from jaxtyping import Float
 
-from ..aliases import PyTree
-from ..errors import ModelError, SimulationError, whole_number
-from ..optional import Axes, new_axes
+from ..base.aliases import PyTree
+from ..base.errors import ModelError, SimulationError, whole_number
+from ..base.optional import Axes, new_axes
 from .beginnings import silent
 from .checkpoint import Described, described, fingerprint, read_facts, read_state, save
 from .evaluation import Evaluation, Weights

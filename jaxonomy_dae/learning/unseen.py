@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import ModelError, SimulationError
+from ..base.errors import ModelError, SimulationError
 from .data import Data
 from .experiment import Experiment
 from .factors import Factors

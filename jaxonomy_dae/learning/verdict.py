@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..diagnosis.wording import listed
+from ..compile.diagnosis.wording import listed
 from .leftover import LEVEL, Leftover
 from .objective import AWAY
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
-from ..modeling import Component, Value
+from ..base.errors import ModelError
+from ..write import Component, Value
 
 
 def finite(values: object, name: str, what: str) -> np.ndarray:

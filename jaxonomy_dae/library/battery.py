@@ -14,9 +14,9 @@ import numpy as np
 import sympy
 from sympy import Max, exp
 
-from ..errors import ModelError
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Interval, Thermal, Value, der, smooth
-from ..modeling.arrays import ComponentArray
+from ..base.errors import ModelError
+from ..write import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Interval, Thermal, Value, der, smooth
+from ..write.arrays import ComponentArray
 from .arguments import count, increasing, row
 from .electrical.two_pin import TwoPin
 from .interpolation import interpolated, known_kind

@@ -3,7 +3,7 @@ momentum over all parts that are joined at that instant (Pfeiffer & Glocker 1996
 Contacts").
 """
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Value, assign, der
+from ..write import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Value, assign, der
 from .arguments import yes_or_no
 from .one_axis import AlongLine, Compliant
 

@@ -9,7 +9,7 @@ import sympy
 from sympy import Abs, And, Max, Min, Ne, Piecewise, sign
 from sympy.logic.boolalg import Boolean
 
-from ..modeling import (
+from ..write import (
     NONNEGATIVE,
     POSITIVE,
     Component,

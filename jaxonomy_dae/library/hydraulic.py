@@ -12,7 +12,7 @@ F. M. White, Fluid Mechanics (McGraw-Hill), the chapter on viscous flow in ducts
 
 import sympy
 
-from ..modeling import (
+from ..write import (
     NONNEGATIVE,
     POSITIVE,
     Component,

@@ -11,8 +11,8 @@ import numpy as np
 import sympy
 from sympy import Max, Min, sympify
 
-from ..errors import ModelError
-from ..modeling import Value, smooth
+from ..base.errors import ModelError
+from ..write import Value, smooth
 
 KINDS = ("linear", "cubic")
 

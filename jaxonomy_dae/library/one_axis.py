@@ -7,8 +7,8 @@ from typing import ClassVar
 import sympy
 from sympy import asinh, exp, sqrt, tanh
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value, der
-from ..modeling.ports import Domain
+from ..write import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value, der
+from ..write.ports import Domain
 
 
 @dataclass(frozen=True)

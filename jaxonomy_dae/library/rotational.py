@@ -4,7 +4,7 @@ Conventions: absolute angle `phi` in radian, torque `tau` in newton metre counte
 flange, so an inertia obeys J·dw/dt = flange_a.tau + flange_b.tau.
 """
 
-from ..modeling import POSITIVE, Component, Eq, EqnEnv, Rotational, Value, der
+from ..write import POSITIVE, Component, Eq, EqnEnv, Rotational, Value, der
 from . import one_axis
 from .arguments import start_of
 from .one_axis import AboutAxis

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import sympy
 
-from ..errors import ModelError
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Thermal, Value, der, smooth
+from ..base.errors import ModelError
+from ..write import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Thermal, Value, der, smooth
 from .arguments import row, start_of
 
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m²·K⁴), CODATA 2018

@@ -6,7 +6,7 @@ mass obeys m·dv/dt = flange.f.
 
 from sympy import Piecewise
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, Value, assign, der
+from ..write import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, Value, assign, der
 from . import one_axis
 from .arguments import start_of
 from .one_axis import AlongLine

@@ -2,7 +2,7 @@
 
 from sympy import pi
 
-from ..modeling import POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value
+from ..write import POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value
 
 
 class Planetary(Component):

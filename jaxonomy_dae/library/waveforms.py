@@ -5,7 +5,7 @@ from typing import ClassVar
 import sympy
 from sympy import Piecewise, frac, pi, sin
 
-from ..modeling import POSITIVE, Component, EqnEnv, Value
+from ..write import POSITIVE, Component, EqnEnv, Value
 
 
 class Driven(Component):

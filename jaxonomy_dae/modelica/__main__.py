@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import JaxonomyDaeError
-from ..modeling.diagram import AcausalDiagram
-from ..modeling.environment import EqnEnv
-from ..simulation.simulate import simulate
-from ..simulation.solution import Solution
-from ..system.acausal_compiler import AcausalCompiler
-from ..system.system import AcausalSystem
+from ..base.errors import JaxonomyDaeError
+from ..run.simulation.simulate import simulate
+from ..run.simulation.solution import Solution
+from ..run.system.acausal_compiler import AcausalCompiler
+from ..run.system.system import AcausalSystem
+from ..write.diagram import AcausalDiagram
+from ..write.environment import EqnEnv
 from .component import FlatComponent
 from .flat_model import FlatModel
 from .load import load

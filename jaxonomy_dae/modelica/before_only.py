@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import sympy
 
-from ..errors import ModelError
-from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+from ..base.errors import ModelError
+from ..write.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 from .definitions import OfAlgorithm, with_entries
 from .scope import Scope
 from .tree import Call, Equality, Expression, Reference, each_part

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import sympy
 
-from ..errors import ModelError
-from ..modeling.automatic_events import smooth
+from ..base.errors import ModelError
+from ..write.automatic_events import smooth
 from .values import Value, as_number, both, chosen, either, entrywise, is_condition
 
 

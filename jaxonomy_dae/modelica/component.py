@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from ..errors import ModelError, nearest
-from ..modeling.component import Component
-from ..modeling.environment import EqnEnv
+from ..base.errors import ModelError, nearest
+from ..write.component import Component
+from ..write.environment import EqnEnv
 from .continuous import write_equation
 from .events import write_end_of_start, write_modes, write_when
 from .flat_model import FlatModel

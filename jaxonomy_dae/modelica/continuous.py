@@ -2,7 +2,7 @@
 
 import sympy
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .definitions import OfAlgorithm
 from .scope import Scope
 from .tree import Branches, Effect, Equality, Expression, Several, Statement

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from . import tree
 
 

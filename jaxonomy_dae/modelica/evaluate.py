@@ -7,8 +7,8 @@ from typing import Any, NoReturn
 
 import sympy
 
-from ..errors import ModelError
-from ..modeling.symbols import VariableSymbol, der
+from ..base.errors import ModelError
+from ..write.symbols import VariableSymbol, der
 from . import tree
 from .builtin import FUNCTIONS, matrix_product
 from .flat_model import literal_numbers

@@ -14,10 +14,10 @@ from typing import TypeAlias, TypeVar
 import sympy
 from sympy.core.relational import Relational
 
-from ..aliases import Condition
-from ..errors import ModelError
-from ..modeling.events import Action, Assign, EventFlag, Sampled, assign, pre, reinit, terminate
-from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+from ..base.aliases import Condition
+from ..base.errors import ModelError
+from ..write.events import Action, Assign, EventFlag, Sampled, assign, pre, reinit, terminate
+from ..write.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 from . import tree
 from .before_only import BeforeOnly
 from .definitions import assigned_in, with_entries

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .learned_law import Law, law_of
 from .read_base import INSIDE, written
 from .tree import Class, Number, Reference

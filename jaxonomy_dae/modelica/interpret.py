@@ -9,7 +9,7 @@ from itertools import islice
 
 import sympy
 
-from ..errors import ModelError, nearest
+from ..base.errors import ModelError, nearest
 from . import tree
 from .builtin import FUNCTIONS, filled
 from .evaluate import Evaluator, Names, index_of, local_names, with_end

@@ -6,9 +6,9 @@ rests at the level, and continuous equations see the one that the modes see.
 
 import sympy
 
-from ..aliases import Condition, Expression
-from ..modeling.automatic_events import varies
-from ..modeling.component import Component
+from ..base.aliases import Condition, Expression
+from ..write.automatic_events import varies
+from ..write.component import Component
 from .values import Value, plain
 
 _ORDER = (sympy.StrictGreaterThan, sympy.GreaterThan, sympy.StrictLessThan, sympy.LessThan)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from ..errors import ModelError, nearest
+from ..base.errors import ModelError, nearest
 from .continuous import add
 from .definitions import OfAlgorithm
 from .learned_law import Law

@@ -7,9 +7,9 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import sympy
 
-from ..errors import ModelError
-from ..modeling.component import Component
-from ..modeling.symbols import VariableSymbol
+from ..base.errors import ModelError
+from ..write.component import Component
+from ..write.symbols import VariableSymbol
 from .values import Value
 
 Law: TypeAlias = Callable[[Component, Value], Value]  # (component, written value) to the value in its place

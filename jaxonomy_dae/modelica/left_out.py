@@ -8,7 +8,7 @@ import numpy as np
 import scipy.special
 import sympy
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .builtin import FUNCTIONS, flattened, matrix_product, of_numbers, total, transposed
 from .operations import ARITHMETIC, RELATIONS
 from .random_numbers import initial_state

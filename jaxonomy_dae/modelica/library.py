@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from .read_base import read_base
 from .tree import Class, Declaration, Modifiers
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import ModelError, nearest
-from ..optional import optional_module
+from ..base.errors import ModelError, nearest
+from ..base.optional import optional_module
 from .complete import completed
 from .flat_model import FlatModel, flat_of
 from .left_out import LEFT_OUT

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import sympy
 
-from ..errors import ModelError
-from ..modeling.symbols import VariableSymbol
+from ..base.errors import ModelError
+from ..write.symbols import VariableSymbol
 from .builtin import power, quotient
 from .values import Record, Value, as_number, both, either, is_condition, negated, parts_of_choice, plain
 

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import sympy
 
-from ..aliases import Numeric
-from ..errors import ModelError
-from ..modeling.component import Component
-from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+from ..base.aliases import Numeric
+from ..base.errors import ModelError
+from ..write.component import Component
+from ..write.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 from .values import Results, Value
 
 Word: TypeAlias = Numeric  # an int below 2^64, or an array of the type uint64

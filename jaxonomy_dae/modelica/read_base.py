@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from typing import NoReturn
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from . import tree
 
 _TOKEN = re.compile(

@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeAlias
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from . import tree
 from .flat_model import FlatModel
 from .rumoca_expressions import PREFIX, SCALAR, VARIABLE, Json, Places, RumocaExpressions

@@ -8,8 +8,8 @@ from typing import Any
 import scipy.optimize
 import sympy
 
-from ..errors import ModelError
-from ..modeling.component import Component
+from ..base.errors import ModelError
+from ..write.component import Component
 from .builtin import FUNCTIONS
 from .values import Value, both, chosen
 

@@ -8,7 +8,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
-from ..errors import ModelError
+from ..base.errors import ModelError
 from . import tree
 
 Places = Mapping[tuple[int, int], int]  # the value of a domain's binder, by the numbers of the domain and the binder

@@ -13,9 +13,9 @@ from typing import TypeVar
 
 import sympy
 
-from ..errors import ModelError
-from ..modeling.component import Component
-from ..modeling.symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, der
+from ..base.errors import ModelError
+from ..write.component import Component
+from ..write.symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, der
 from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter

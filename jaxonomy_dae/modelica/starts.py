@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import sympy
 
-from ..errors import ModelError
-from ..modeling.events import assign
-from ..modeling.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
+from ..base.errors import ModelError
+from ..write.events import assign
+from ..write.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
 from .continuous import equal, pairs, side_by_side
 from .definitions import assigned_in, with_entries
 from .scope import Scope

@@ -11,8 +11,8 @@ import numpy as np
 import scipy.interpolate
 import sympy
 
-from ..errors import ModelError
-from ..modeling.automatic_events import smooth
+from ..base.errors import ModelError
+from ..write.automatic_events import smooth
 from .values import Value, chosen
 
 # The literals of Modelica.Blocks.Types.Smoothness and Extrapolation.

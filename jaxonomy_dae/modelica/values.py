@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 import sympy
 from sympy.logic.boolalg import Boolean
 
-from ..errors import ModelError
-from ..modeling.automatic_events import smooth
+from ..base.errors import ModelError
+from ..write.automatic_events import smooth
 
 Value: TypeAlias = Any  # float | int | bool | str | sympy.Expr | Boolean | list | Record
 

@@ -3,10 +3,10 @@
 import jax
 import numpy as np
 
-from ..errors import ModelError
-from ..programs.cache import compiled
-from ..programs.staging import is_traced
-from ..simulation.solution import Solution
+from ..base.errors import ModelError
+from ..host.cache import compiled
+from ..host.staging import is_traced
+from ..run.simulation.solution import Solution
 from .certificate import Certificate
 
 

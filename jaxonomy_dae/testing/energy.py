@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from ..diagnosis.wording import some
-from ..simulation.accounts import silent_components
-from ..simulation.energy_balance import energy_balance
-from ..simulation.solution import Solution
+from ..compile.diagnosis.wording import some
+from ..run.simulation.accounts import silent_components
+from ..run.simulation.energy_balance import energy_balance
+from ..run.simulation.solution import Solution
 from .certificate import Certificate
 
 

@@ -11,9 +11,9 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ..adjoint.stored_adjoint import forward_mode
-from ..aliases import PyTree
-from ..errors import ModelError
+from ..base.aliases import PyTree
+from ..base.errors import ModelError
+from ..solve.adjoint.stored_adjoint import forward_mode
 from .certificate import Certificate
 
 EACH = 16  # up to this many numbers, each is a direction of its own

@@ -11,8 +11,8 @@ import scipy.optimize
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from ..aliases import PyTree
-from ..errors import ModelError, whole_number
+from ..base.aliases import PyTree
+from ..base.errors import ModelError, whole_number
 from ..learning.laws import AbstractPassive, PortHamiltonian
 from .certificate import Certificate
 

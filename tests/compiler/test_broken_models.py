@@ -9,7 +9,7 @@ import pytest
 from recipes import compiler_of, draw_recipe, names_of, outcome
 
 from jaxonomy_dae import ModelError
-from jaxonomy_dae.compiler.flatten import flatten
+from jaxonomy_dae.compile.passes.flatten import flatten
 
 
 def check_text(names, system, text):

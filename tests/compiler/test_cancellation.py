@@ -5,16 +5,16 @@ import pytest
 import sympy
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
-from jaxonomy_dae.compiler.combine_equations import combine, quantity_label
-from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
+from jaxonomy_dae.base.tolerances import ILL_CONDITIONED
+from jaxonomy_dae.compile.passes.combine_equations import combine, quantity_label
+from jaxonomy_dae.compile.passes.null_vectors import cancels, left_null_vectors
 from jaxonomy_dae.errors import StructuralError
-from jaxonomy_dae.expressions.differentiate import directional_derivative
-from jaxonomy_dae.expressions.functions import apply
-from jaxonomy_dae.expressions.kernel import Kernel
-from jaxonomy_dae.expressions.node import compare, constant, leaf, linear, multiply, power, scale, select
-from jaxonomy_dae.judgement.rank import are_evident, rank_of, rounding
-from jaxonomy_dae.judgement.scaling import geometric_scales
-from jaxonomy_dae.tolerances import ILL_CONDITIONED
+from jaxonomy_dae.graph.expressions.differentiate import directional_derivative
+from jaxonomy_dae.graph.expressions.functions import apply
+from jaxonomy_dae.graph.expressions.kernel import Kernel
+from jaxonomy_dae.graph.expressions.node import compare, constant, leaf, linear, multiply, power, scale, select
+from jaxonomy_dae.graph.judgement.rank import are_evident, rank_of, rounding
+from jaxonomy_dae.graph.judgement.scaling import geometric_scales
 
 
 class _Written(Component):

@@ -16,12 +16,12 @@ MODULES = ("solvers", "linear", "learning", "plotting", "testing")
 
 
 def public_names() -> list[str]:
-    """What can be imported: re-exports, and what modules without a folder define."""
+    """What can be imported: re-exports, and what a module defines that has none."""
     found = []
     for name in ("", *MODULES):
         module = importlib.import_module(f"jaxonomy_dae.{name}".rstrip("."))
-        path = pathlib.Path(module.__file__ or "")
-        own = re.findall(r" as (\w+)$" if path.name == "__init__.py" else r"^def ([a-z]\w*)", path.read_text(), re.M)
+        text = pathlib.Path(module.__file__ or "").read_text()
+        own = re.findall(r"^from .* as (\w+)$", text, re.M) or re.findall(r"^def ([a-z]\w*)", text, re.M)
         found += [f"{module.__name__}.{n}" for n in own]
     return found
 

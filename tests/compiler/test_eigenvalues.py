@@ -6,13 +6,13 @@ import scipy.sparse.linalg
 from problems import compiled, oscillator, pendulum, rc_circuit
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, der
+from jaxonomy_dae.compile.model.consistent_point import initial_point
+from jaxonomy_dae.compile.model.jacobian import residual_and_jacobian
+from jaxonomy_dae.compile.model.tables import Declared
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 from jaxonomy_dae.library.planar import PlanarPendulum
-from jaxonomy_dae.linear.sparse_least_squares import SparseLeastSquares, regular_factors
-from jaxonomy_dae.model.consistent_point import initial_point
-from jaxonomy_dae.model.jacobian import residual_and_jacobian
-from jaxonomy_dae.model.tables import Declared
-from jaxonomy_dae.system.solver_choice import fastest_decay as fastest_decay_of
+from jaxonomy_dae.run.system.solver_choice import fastest_decay as fastest_decay_of
+from jaxonomy_dae.solve.linear.sparse_least_squares import SparseLeastSquares, regular_factors
 
 
 class Follower(Component):

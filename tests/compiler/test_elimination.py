@@ -8,11 +8,11 @@ import sympy
 from problems import compiled, component
 
 from jaxonomy_dae import StructuralError, der
-from jaxonomy_dae.compiler.elimination import null_vectors
-from jaxonomy_dae.compiler.null_vectors import BlockMatrix
-from jaxonomy_dae.compiler.null_vectors import null_vectors as of_block
-from jaxonomy_dae.compiler.rounded import Rounded
-from jaxonomy_dae.model.group import Point
+from jaxonomy_dae.compile.model.group import Point
+from jaxonomy_dae.compile.passes.elimination import null_vectors
+from jaxonomy_dae.compile.passes.null_vectors import BlockMatrix
+from jaxonomy_dae.compile.passes.null_vectors import null_vectors as of_block
+from jaxonomy_dae.compile.passes.rounded import Rounded
 
 
 def rounded(value):

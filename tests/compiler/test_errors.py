@@ -28,11 +28,11 @@ from jaxonomy_dae import (
     der,
     simulate,
 )
+from jaxonomy_dae.base.optional import optional_module
 from jaxonomy_dae.library.electrical import Ground, Resistor
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.translational import Mass, Spring
-from jaxonomy_dae.modeling import Eq as our_eq
-from jaxonomy_dae.optional import optional_module
+from jaxonomy_dae.write import Eq as our_eq
 
 
 def dense(inputs, outputs):

@@ -9,7 +9,7 @@ import pytest
 
 import jaxonomy_dae
 from jaxonomy_dae import ModelError
-from jaxonomy_dae.errors.page import GAP, entries, entry_for
+from jaxonomy_dae.base.errors.page import GAP, entries, entry_for
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs"
 

@@ -18,9 +18,9 @@ from jaxonomy_dae import (
 )
 from jaxonomy_dae.library import hydraulic as hyd
 from jaxonomy_dae.library import signal as sig
-from jaxonomy_dae.modeling.automatic_events import relations_left_alone
-from jaxonomy_dae.modeling.events import guard_of, has_guard
-from jaxonomy_dae.modeling.symbols import DiscreteSymbol, VariableSymbol
+from jaxonomy_dae.write.automatic_events import relations_left_alone
+from jaxonomy_dae.write.events import guard_of, has_guard
+from jaxonomy_dae.write.symbols import DiscreteSymbol, VariableSymbol
 
 
 def clock_hand(self):

@@ -12,6 +12,9 @@ from problems import EV, FreeMass, compiled, component, without_lines
 from sympy import Eq, exp, sin
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, StructuralError, der
+from jaxonomy_dae.graph.structure.dulmage_mendelsohn import dulmage_mendelsohn
+from jaxonomy_dae.graph.structure.incidence import Incidence, compress
+from jaxonomy_dae.graph.structure.matching import maximum_matching
 from jaxonomy_dae.library.electrical import (
     Capacitor,
     CurrentSource,
@@ -24,10 +27,7 @@ from jaxonomy_dae.library.electrical import (
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.thermal import FixedTemperature, HeatCapacitor, ThermalConductor
 from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Rod, Spring
-from jaxonomy_dae.modeling import Domain, Electrical
-from jaxonomy_dae.structure.dulmage_mendelsohn import dulmage_mendelsohn
-from jaxonomy_dae.structure.incidence import Incidence, compress
-from jaxonomy_dae.structure.matching import maximum_matching
+from jaxonomy_dae.write import Domain, Electrical
 
 KINDS = {
     cls.__name__: cls

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxonomy_dae.system.sections import folded
+from jaxonomy_dae.run.system.sections import folded
 
 
 @pytest.mark.parametrize(

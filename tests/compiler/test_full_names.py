@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxonomy_dae import AcausalDiagram, Component, Electrical, EqnEnv, der
-from jaxonomy_dae.compiler.flatten import flatten
+from jaxonomy_dae.compile.passes.flatten import flatten
 from jaxonomy_dae.library.electrical import Capacitor, Resistor
 
 

@@ -12,7 +12,7 @@ from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.learning import Data, Experiment, Filter, GradientSteps, Innovations, Problem, Shooting, Unknown
 from jaxonomy_dae.learning.training import _facts
-from jaxonomy_dae.modeling import Component, Eq, der
+from jaxonomy_dae.write import Component, Eq, der
 
 TIMES = np.array([1.0, 2.0, 3.0])
 

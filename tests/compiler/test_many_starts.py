@@ -6,7 +6,7 @@ from problems import compiled
 from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv, der
-from jaxonomy_dae.initialization.rows import initial_rows, supports
+from jaxonomy_dae.run.start.rows import initial_rows, supports
 
 
 class Sums(Component):

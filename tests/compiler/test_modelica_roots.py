@@ -6,7 +6,7 @@ import pytest
 import sympy
 
 from jaxonomy_dae.errors import ModelError
-from jaxonomy_dae.expressions.smooth import Smooth
+from jaxonomy_dae.graph.expressions.smooth import Smooth
 from jaxonomy_dae.modelica import load
 from jaxonomy_dae.modelica.interpret import Interpreter
 from jaxonomy_dae.modelica.roots import ROOT, root

@@ -9,7 +9,7 @@ import sympy
 from modelica_texts import BALL, BLOCK, PIPE
 
 from jaxonomy_dae import EqnEnv, ModelError
-from jaxonomy_dae.expressions.smooth import Smooth
+from jaxonomy_dae.graph.expressions.smooth import Smooth
 from jaxonomy_dae.modelica import FlatComponent, load, read_base
 from jaxonomy_dae.modelica.interpret import Interpreter
 from jaxonomy_dae.modelica.left_out import LEFT_OUT, time_table_coefficients
@@ -17,7 +17,7 @@ from jaxonomy_dae.modelica.random_numbers import GENERATORS, number
 from jaxonomy_dae.modelica.semi_linear import with_chains_solved
 from jaxonomy_dae.modelica.tables import Table, table_1d
 from jaxonomy_dae.modelica.tree import Binary, Call, Number, Reference, Unary
-from jaxonomy_dae.modeling.symbols import VariableSymbol
+from jaxonomy_dae.write.symbols import VariableSymbol
 
 
 def value_of(text: str, **names):

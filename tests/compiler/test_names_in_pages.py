@@ -10,8 +10,8 @@ import pytest
 
 import jaxonomy_dae
 from jaxonomy_dae import AcausalDiagram, Component, learning, simulate, solvers
-from jaxonomy_dae.simulation.solution import Solution
-from jaxonomy_dae.system.system import AcausalSystem
+from jaxonomy_dae.run.simulation.solution import Solution
+from jaxonomy_dae.run.system.system import AcausalSystem
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs"
 PAGES = [path.relative_to(DOCS).as_posix() for path in sorted(DOCS.rglob("*.md"))] + ["llms.txt", "../README.md"]

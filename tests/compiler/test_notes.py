@@ -7,7 +7,7 @@ from problems import compiled
 from sympy import sin
 
 from jaxonomy_dae import Component, EqnEnv, assign, der, pre, reinit
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 
 class Declared(Component):

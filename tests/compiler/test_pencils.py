@@ -9,10 +9,10 @@ from pencils import pencils
 from shared_models import written
 
 from jaxonomy_dae import AcausalDiagram, Component
-from jaxonomy_dae.compiler.flatten import flatten
-from jaxonomy_dae.compiler.pipeline import compile_flat
-from jaxonomy_dae.lowering.lower import lower
-from jaxonomy_dae.system.report import SystemReport
+from jaxonomy_dae.compile.lowering.lower import lower
+from jaxonomy_dae.compile.passes.flatten import flatten
+from jaxonomy_dae.compile.passes.pipeline import compile_flat
+from jaxonomy_dae.run.system.report import SystemReport
 
 
 def plan_of(component: Component):

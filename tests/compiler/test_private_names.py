@@ -9,11 +9,11 @@ import pytest
 from problems import run
 
 import jaxonomy_dae
-from jaxonomy_dae import private_names
+from jaxonomy_dae.base import private_names
 
 PACKAGE = Path(jaxonomy_dae.__file__).parent
 LIBRARIES = ("diffrax", "equinox", "optimistix", "lineax", "jax")
-FILE = PACKAGE / "private_names.py"
+FILE = PACKAGE / "base" / "private_names.py"
 MOVING = ("jax.extend", "jax.experimental", "jax.interpreters")  # public, but JAX promises nothing
 
 

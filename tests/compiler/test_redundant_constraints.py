@@ -7,9 +7,9 @@ from problems import compiled, component
 import jaxonomy_dae.library.planar as pl
 import jaxonomy_dae.library.rotational as rot
 from jaxonomy_dae import EqnEnv, StructuralError
-from jaxonomy_dae.diagnosis import redundant_constraints
-from jaxonomy_dae.model import consistent_point
-from jaxonomy_dae.modeling import Eq, der
+from jaxonomy_dae.compile.diagnosis import redundant_constraints
+from jaxonomy_dae.compile.model import consistent_point
+from jaxonomy_dae.write import Eq, der
 
 
 @pytest.fixture(params=["whole", "sampled", "many"], autouse=True)

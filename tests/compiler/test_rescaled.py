@@ -18,7 +18,7 @@ from shared_models import MIXED, WITHOUT_NETWORKS, written
 from testset import PROBLEMS
 
 from jaxonomy_dae import AcausalCompiler, Component, EqnEnv, der
-from jaxonomy_dae.initialization.rows import initial_rows
+from jaxonomy_dae.run.start.rows import initial_rows
 
 LARGE = ("grid", "nonlinear grid", "attenuator", "ladder", "cascade")
 SMALL = [name for name in WITHOUT_NETWORKS if name not in LARGE]

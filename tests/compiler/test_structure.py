@@ -8,10 +8,10 @@ import scipy.optimize
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-from jaxonomy_dae.structure.incidence import Incidence, compress
-from jaxonomy_dae.structure.matching import maximum_matching
-from jaxonomy_dae.structure.pantelides import reduce_index
-from jaxonomy_dae.structure.tearing import tear
+from jaxonomy_dae.graph.structure.incidence import Incidence, compress
+from jaxonomy_dae.graph.structure.matching import maximum_matching
+from jaxonomy_dae.graph.structure.pantelides import reduce_index
+from jaxonomy_dae.graph.structure.tearing import tear
 
 ABSENT = -1
 

@@ -21,14 +21,14 @@ from jaxonomy_dae import (
     pre,
     reinit,
 )
-from jaxonomy_dae.compiler import check_units as pass_
-from jaxonomy_dae.compiler.check_units import check_units
+from jaxonomy_dae.compile.passes import check_units as pass_
+from jaxonomy_dae.compile.passes.check_units import check_units
+from jaxonomy_dae.graph.units.parse import UnknownUnit, read_unit
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 from jaxonomy_dae.library.rotational import SpeedSensor
 from jaxonomy_dae.library.signal import Gain
 from jaxonomy_dae.library.translational import Mass, SpeedSource
-from jaxonomy_dae.modeling import Eq
-from jaxonomy_dae.units.parse import UnknownUnit, read_unit
+from jaxonomy_dae.write import Eq
 
 EV = EqnEnv()
 
@@ -523,7 +523,7 @@ def test_a_model_that_fits_compiles_to_the_same_system():
 
 
 def test_the_missing_package_names_the_extra(monkeypatch):
-    from jaxonomy_dae.units import parse
+    from jaxonomy_dae.graph.units import parse
 
     parse._registry.cache_clear()
     parse.read_unit.cache_clear()

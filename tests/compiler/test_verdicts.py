@@ -17,10 +17,10 @@ from verdicts import MODELS, verdict
 
 import jaxonomy_dae
 from jaxonomy_dae import AcausalDiagram, der
-from jaxonomy_dae.compiler.flatten import flatten
-from jaxonomy_dae.compiler.pipeline import compile_flat
-from jaxonomy_dae.initialization.singular_blocks import examine_blocks
-from jaxonomy_dae.lowering.lower import lower
+from jaxonomy_dae.compile.lowering.lower import lower
+from jaxonomy_dae.compile.passes.flatten import flatten
+from jaxonomy_dae.compile.passes.pipeline import compile_flat
+from jaxonomy_dae.run.start.singular_blocks import examine_blocks
 
 CASES = [(name, mode) for name, model in MODELS.items() for mode in model.modes]
 

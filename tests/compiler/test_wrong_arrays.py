@@ -6,7 +6,7 @@ from cell_arrays import Cell, Gated, array_of, ladder, times
 from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, Component, ModelError, der, simulate
-from jaxonomy_dae.compiler import read_equations
+from jaxonomy_dae.compile.passes import read_equations
 from jaxonomy_dae.library.thermal import HeatCapacitor
 
 

@@ -18,7 +18,7 @@ from jaxonomy_dae.library.hydraulic import LaminarPipe, Orifice, PressureSource,
 from jaxonomy_dae.library.interpolation import interpolated
 from jaxonomy_dae.library.thermal import Convection, Radiation, Wall
 from jaxonomy_dae.library.transmissions import LeadScrew, Planetary
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 SOC = np.array([0.0, 0.1, 0.25, 0.5, 0.8, 1.0])
 OCV = np.array([3.0, 3.45, 3.58, 3.7, 3.97, 4.19])

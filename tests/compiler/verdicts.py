@@ -12,13 +12,13 @@ from sympy import cos, sin
 
 import jaxonomy_dae.library.planar as pl
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, StructuralError
-from jaxonomy_dae.compiler.flatten import flatten
-from jaxonomy_dae.compiler.pipeline import compile_flat
-from jaxonomy_dae.initialization.singular_blocks import examine_blocks
-from jaxonomy_dae.lowering.lower import lower
-from jaxonomy_dae.model.consistent_point import initial_point
-from jaxonomy_dae.model.declared import start_guess
-from jaxonomy_dae.modeling import Eq, der
+from jaxonomy_dae.compile.lowering.lower import lower
+from jaxonomy_dae.compile.model.consistent_point import initial_point
+from jaxonomy_dae.compile.model.declared import start_guess
+from jaxonomy_dae.compile.passes.flatten import flatten
+from jaxonomy_dae.compile.passes.pipeline import compile_flat
+from jaxonomy_dae.run.start.singular_blocks import examine_blocks
+from jaxonomy_dae.write import Eq, der
 
 MODES = ("auto", "dummy_derivatives", "projection")
 FOUR = 4 * np.finfo(float).eps

@@ -7,8 +7,8 @@ import pytest
 from problems import compiled, component, mlp
 
 from jaxonomy_dae import Interval, ModelError
-from jaxonomy_dae.modeling.interval import NONNEGATIVE, POSITIVE
-from jaxonomy_dae.system.bounds import Ends, constrained, unconstrained
+from jaxonomy_dae.run.system.bounds import Ends, constrained, unconstrained
+from jaxonomy_dae.write.interval import NONNEGATIVE, POSITIVE
 
 INTERVALS = [
     POSITIVE, NONNEGATIVE, Interval(3.0), Interval(high=-2.0), Interval(-1.0, 2.0), Interval(0.1, 0.3, True, True),

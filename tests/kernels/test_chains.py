@@ -11,8 +11,8 @@ from problems import compiled
 from shared_models import cascade, gain
 
 from jaxonomy_dae import Component, EqnEnv, der
-from jaxonomy_dae.lowering import merge
-from jaxonomy_dae.lowering.program import PlannedLoop, PlannedSparse
+from jaxonomy_dae.compile.lowering import merge
+from jaxonomy_dae.compile.lowering.program import PlannedLoop, PlannedSparse
 
 TIGHT = dict(rtol=1e-12, atol=1e-13)
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.linear.dense import over
-from jaxonomy_dae.linear.inverse import inverse
-from jaxonomy_dae.linear.once import joined, once, once_in_batches, stacked, stacked_in_batches
-from jaxonomy_dae.linear.torn import solve_torn
-from jaxonomy_dae.structure.tearing import Tearing
+from jaxonomy_dae.graph.structure.tearing import Tearing
+from jaxonomy_dae.solve.linear.dense import over
+from jaxonomy_dae.solve.linear.inverse import inverse
+from jaxonomy_dae.solve.linear.once import joined, once, once_in_batches, stacked, stacked_in_batches
+from jaxonomy_dae.solve.linear.torn import solve_torn
 
 BACKENDS = ["cpu", "elsewhere"]
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from jaxonomy_dae import InitializationError, ModelError, SimulationError
+from jaxonomy_dae.solve.methods.dae_term import FlatProblem
+from jaxonomy_dae.solve.methods.failures import explain_start, start_check
 from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, consistent_start, solve_dae
-from jaxonomy_dae.solvers.dae_term import FlatProblem
-from jaxonomy_dae.solvers.failures import explain_start, start_check
 
 ONE, NONE = np.ones(1), np.zeros(1)
 NAMES = ("a.x", "a.z")

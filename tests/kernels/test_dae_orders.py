@@ -15,8 +15,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 
+from jaxonomy_dae.solve.methods.newton import Tolerances
 from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P
-from jaxonomy_dae.solvers.newton import Tolerances
 
 END = 1.0
 TINY, LARGEST, GROWTH = 1e-8, 0.04, 1.1  # of BDF's steps

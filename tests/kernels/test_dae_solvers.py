@@ -12,7 +12,7 @@ from testset import PROBLEMS
 from testset.problem import load
 
 from jaxonomy_dae.linear import KLU, Dense
-from jaxonomy_dae.linear.sparse import SparsePattern
+from jaxonomy_dae.solve.linear.sparse import SparsePattern
 from jaxonomy_dae.solvers import BDF, DAETerm, Projected, Rodas5P, StepControl, solve_dae
 
 RODAS5P = Rodas5P()

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.linear.algebra import EXPLICIT_INVERSE, Dense
+from jaxonomy_dae.solve.linear.algebra import EXPLICIT_INVERSE, Dense
 
 
 @pytest.mark.parametrize("blocks", [2, 4, EXPLICIT_INVERSE])

@@ -10,10 +10,10 @@ import pytest
 from affine_events import CLOCKS, EVENTS, GUARDS, MAX_EVENTS, STATES, Affine, Event, Numbers, affine
 
 from jaxonomy_dae import ModelError
-from jaxonomy_dae.hybrid.event_map import handle
-from jaxonomy_dae.hybrid.instant import Arrival
-from jaxonomy_dae.hybrid.search import first_crossing
-from jaxonomy_dae.hybrid.start import start
+from jaxonomy_dae.solve.events.event_map import handle
+from jaxonomy_dae.solve.events.instant import Arrival
+from jaxonomy_dae.solve.events.search import first_crossing
+from jaxonomy_dae.solve.events.start import start
 
 MEMBERS = 16
 

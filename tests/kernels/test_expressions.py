@@ -10,11 +10,11 @@ import sympy
 from test_functions import compiled
 
 from jaxonomy_dae import der
-from jaxonomy_dae.expressions.differentiate import directional_derivative, partial_derivative
-from jaxonomy_dae.expressions.from_sympy import read
-from jaxonomy_dae.expressions.kernel import Kernel
-from jaxonomy_dae.expressions.node import ONE, leaf, postorder
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.graph.expressions.differentiate import directional_derivative, partial_derivative
+from jaxonomy_dae.graph.expressions.from_sympy import read
+from jaxonomy_dae.graph.expressions.kernel import Kernel
+from jaxonomy_dae.graph.expressions.node import ONE, leaf, postorder
+from jaxonomy_dae.write import Eq
 
 X, Y = sympy.symbols("x y", real=True)
 

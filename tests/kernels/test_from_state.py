@@ -9,7 +9,7 @@ from problems import compiled
 from jaxonomy_dae import EqnEnv, simulate
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.library.planar import PlanarPendulum
-from jaxonomy_dae.simulation.from_state import from_state
+from jaxonomy_dae.run.simulation.from_state import from_state
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from function_table import FUNCTIONS
 from problems import run
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 NAMES = list(FUNCTIONS)
 POINTS = np.array([point for _, _, point in FUNCTIONS.values()])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxonomy_dae.adjoint import stored_adjoint
+from jaxonomy_dae.solve.adjoint import stored_adjoint
 from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, StoredAdjoint, Tsit5, solve_dae
 
 # At rest, a step errs by rtol/0.03, 3e-8 of the motion; 20 rad s take some 60 of them.

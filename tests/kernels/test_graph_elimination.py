@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from jaxonomy_dae.linear.graph_elimination import GraphElimination
+from jaxonomy_dae.solve.linear.graph_elimination import GraphElimination
 
 
 def graph(kind: str, n: int):

@@ -26,12 +26,12 @@ from hybrid_references import (
     falling_balls,
 )
 
-from jaxonomy_dae.hybrid.control import ENDED
-from jaxonomy_dae.hybrid.side import RESTS
-from jaxonomy_dae.hybrid.solver import NOT_FINITE, STUCK, TOO_MANY
-from jaxonomy_dae.hybrid.start import start
-from jaxonomy_dae.modeling.events import NO_FLAG, EventFlag
+from jaxonomy_dae.solve.events.control import ENDED
+from jaxonomy_dae.solve.events.side import RESTS
+from jaxonomy_dae.solve.events.solver import NOT_FINITE, STUCK, TOO_MANY
+from jaxonomy_dae.solve.events.start import start
 from jaxonomy_dae.solvers import StoredAdjoint
+from jaxonomy_dae.write.events import NO_FLAG, EventFlag
 
 SAVED = 60
 OKAY = diffrax.RESULTS.successful._value

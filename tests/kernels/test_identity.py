@@ -30,8 +30,8 @@ from jaxonomy_dae import (
     simulate,
     terminate,
 )
-from jaxonomy_dae.model.identity import Identity
-from jaxonomy_dae.model.tables import Declared
+from jaxonomy_dae.compile.model.identity import Identity
+from jaxonomy_dae.compile.model.tables import Declared
 
 # What says nothing of one declaration: how parts are put together, and what reads names.
 ELSEWHERE = {"add", "connect", "symbol", "outside_path", "add_equations"}

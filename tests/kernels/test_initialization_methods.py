@@ -10,10 +10,10 @@ from problems import compiled, pendulum
 from sympy import Eq, atan
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, der, simulate
-from jaxonomy_dae.initialization import initialize as initialization
-from jaxonomy_dae.initialization.initialize import find_initial, is_consistent
-from jaxonomy_dae.initialization.ladder import METHODS, find_root, looking
-from jaxonomy_dae.initialization.sizes import Sizes
+from jaxonomy_dae.run.start import initialize as initialization
+from jaxonomy_dae.run.start.initialize import find_initial, is_consistent
+from jaxonomy_dae.run.start.ladder import METHODS, find_root, looking
+from jaxonomy_dae.run.start.sizes import Sizes
 
 # x³ − 2x + 2 = 0 has one real root, by Cardano's formula; |F| has a local minimum at √(2/3), where F = 2 − (4/3)√(2/3).
 CARDANO = -np.cbrt(1 + np.sqrt(19 / 27)) - np.cbrt(1 - np.sqrt(19 / 27))

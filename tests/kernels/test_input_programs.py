@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxonomy_dae.system.closed_function import closed_function
+from jaxonomy_dae.run.system.closed_function import closed_function
 
 
 def with_jvp(slope):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxonomy_dae.model.identity import Identity
-from jaxonomy_dae.structure.integers import distinct, equal_rows
+from jaxonomy_dae.compile.model.identity import Identity
+from jaxonomy_dae.graph.structure.integers import distinct, equal_rows
 
 
 @pytest.mark.parametrize("shape", [(0,), (1,), (40,), (7, 5)])

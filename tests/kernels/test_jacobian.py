@@ -8,8 +8,8 @@ from problems import rc_ladder
 from shared_models import MODELS, cascade
 
 from jaxonomy_dae import ModelError
-from jaxonomy_dae.lowering import pattern
-from jaxonomy_dae.system.nonlinear import Refinement
+from jaxonomy_dae.compile.lowering import pattern
+from jaxonomy_dae.run.system.nonlinear import Refinement
 
 
 def covers(found, dense: np.ndarray):

@@ -13,18 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.adjoint.ends import ending
-from jaxonomy_dae.adjoint.late_times import Integration
 from jaxonomy_dae.errors import ModelError
-from jaxonomy_dae.hybrid.control import AtEvents
-from jaxonomy_dae.hybrid.facts import EventFacts
-from jaxonomy_dae.hybrid.first_order import differentiable_once
-from jaxonomy_dae.hybrid.problem import AbstractHybridProblem, HybridTerm
-from jaxonomy_dae.hybrid.solver import WithEvents
-from jaxonomy_dae.hybrid.start import start
-from jaxonomy_dae.modeling.events import EventFlag
+from jaxonomy_dae.solve.adjoint.ends import ending
+from jaxonomy_dae.solve.adjoint.late_times import Integration
+from jaxonomy_dae.solve.events.control import AtEvents
+from jaxonomy_dae.solve.events.facts import EventFacts
+from jaxonomy_dae.solve.events.first_order import differentiable_once
+from jaxonomy_dae.solve.events.problem import AbstractHybridProblem, HybridTerm
+from jaxonomy_dae.solve.events.solver import WithEvents
+from jaxonomy_dae.solve.events.start import start
+from jaxonomy_dae.solve.methods.drive import integrate
 from jaxonomy_dae.solvers import StoredAdjoint
-from jaxonomy_dae.solvers.drive import integrate
+from jaxonomy_dae.write.events import EventFlag
 
 END = 3.0
 RELATION = EventFlag.AT_START | EventFlag.REVOCABLE | EventFlag.RELATION

@@ -10,10 +10,10 @@ import pytest
 from shared_models import Grid
 
 from jaxonomy_dae import Component, ModelError
-from jaxonomy_dae.linear import sparse
-from jaxonomy_dae.lowering import schedule
-from jaxonomy_dae.lowering.schedule import SparseStep
-from jaxonomy_dae.modeling import Electrical
+from jaxonomy_dae.compile.lowering import schedule
+from jaxonomy_dae.compile.lowering.schedule import SparseStep
+from jaxonomy_dae.solve.linear import sparse
+from jaxonomy_dae.write import Electrical
 
 needs_klu = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
 

@@ -19,10 +19,10 @@ from problems import run
 
 from benchmarks.attack.invariance.declarations import PAIRS, STRUCTURE, built
 from jaxonomy_dae import solvers
-from jaxonomy_dae.programs import kept, lasting, tiers
-from jaxonomy_dae.programs.cache import ProgramCache
-from jaxonomy_dae.programs.compilations import compilations
-from jaxonomy_dae.programs.lasting import types_of
+from jaxonomy_dae.host import kept, lasting, tiers
+from jaxonomy_dae.host.cache import ProgramCache
+from jaxonomy_dae.host.compilations import compilations
+from jaxonomy_dae.host.lasting import types_of
 
 FORM, TRACES = [jnp.sin], []
 

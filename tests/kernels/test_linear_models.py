@@ -5,7 +5,7 @@ from sympy import Max, cos, sin, sqrt
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
 from jaxonomy_dae.learning.linear_models import is_linear
-from jaxonomy_dae.modeling import Component, Eq, der
+from jaxonomy_dae.write import Component, Eq, der
 
 
 def compiled(slope):

@@ -12,8 +12,8 @@ from testset.heat import heat_exact, sundials_heat2d
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, SimulationError, der, simulate
 from jaxonomy_dae.linear import KLU, Dense, SparseLinearOperator, SparsePattern, WrittenOut
-from jaxonomy_dae.linear.choice import check_linear_solver, choose
-from jaxonomy_dae.linear.dense import least_squares
+from jaxonomy_dae.solve.linear.choice import check_linear_solver, choose
+from jaxonomy_dae.solve.linear.dense import least_squares
 from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, solve_dae
 
 installed = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')

@@ -9,10 +9,10 @@ import sympy
 from problems import compiled, component
 
 from jaxonomy_dae import InitializationError, SteadyStateError, der, steady_state
-from jaxonomy_dae.expressions.from_sympy import read
-from jaxonomy_dae.expressions.kernel import Kernel
-from jaxonomy_dae.expressions.magnitude import magnitude
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.graph.expressions.from_sympy import read
+from jaxonomy_dae.graph.expressions.kernel import Kernel
+from jaxonomy_dae.graph.expressions.magnitude import magnitude
+from jaxonomy_dae.write import Eq
 
 X, Y = sympy.symbols("x y", real=True)
 # Expressions, and their magnitudes by hand at x = -2, y = 3, where y stands for terms of the size 10.

@@ -9,8 +9,8 @@ import pytest
 from problems import rc_circuit
 
 from jaxonomy_dae import ModelError, compilations
+from jaxonomy_dae.host import tiers
 from jaxonomy_dae.learning import minimize
-from jaxonomy_dae.programs import tiers
 
 
 class Bowl(eqx.Module):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.linear.newton import Tried, newton, twice
+from jaxonomy_dae.solve.linear.newton import Tried, newton, twice
 
 
 def arctan(xp):

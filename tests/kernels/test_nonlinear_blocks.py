@@ -11,8 +11,8 @@ from problems import compiled
 from sympy import Abs, Max, Min, atan, exp
 
 from jaxonomy_dae import Component, EqnEnv, der, smooth
-from jaxonomy_dae.lowering import schedule
-from jaxonomy_dae.lowering.schedule import SparseStep
+from jaxonomy_dae.compile.lowering import schedule
+from jaxonomy_dae.compile.lowering.schedule import SparseStep
 
 
 class Implicit(Component):

@@ -12,7 +12,7 @@ from sympy import Eq, sqrt
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
 from jaxonomy_dae.learning import minimize
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
-from jaxonomy_dae.modeling import Electrical
+from jaxonomy_dae.write import Electrical
 
 
 class Halves(Component):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, ModelError, der
+from jaxonomy_dae.compile.model.tables import ZERO
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 from jaxonomy_dae.library.planar import PlanarPendulum
-from jaxonomy_dae.model.tables import ZERO
 
 
 class Reaction(Component):

@@ -8,7 +8,7 @@ import pytest
 from problems import pendulum
 
 from jaxonomy_dae import simulate
-from jaxonomy_dae.programs.platform import platform, precisely
+from jaxonomy_dae.host.platform import platform, precisely
 from jaxonomy_dae.solvers import Rodas5P
 
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.programs import cache, machine
-from jaxonomy_dae.programs.machine import Use
-from jaxonomy_dae.programs.staging import is_staged
+from jaxonomy_dae.host import cache, machine
+from jaxonomy_dae.host.machine import Use
+from jaxonomy_dae.host.staging import is_staged
 
 KERNELS = 10
 on_linux = pytest.mark.skipif(machine.mappings() is None, reason="no mappings are counted here")

@@ -6,11 +6,11 @@ import pytest
 import scipy.sparse as sp
 import sympy
 
-from jaxonomy_dae.expressions.errors import KernelWithErrors
-from jaxonomy_dae.expressions.from_sympy import read
-from jaxonomy_dae.judgement.rank import rank_of, rounding
-from jaxonomy_dae.judgement.sparse_rank import sparse_rank_of
-from jaxonomy_dae.tolerances import EPS, KNOWN
+from jaxonomy_dae.base.tolerances import EPS, KNOWN
+from jaxonomy_dae.graph.expressions.errors import KernelWithErrors
+from jaxonomy_dae.graph.expressions.from_sympy import read
+from jaxonomy_dae.graph.judgement.rank import rank_of, rounding
+from jaxonomy_dae.graph.judgement.sparse_rank import sparse_rank_of
 
 X, Y, Z = symbols = sympy.symbols("x y z")
 EXPRESSIONS = [

@@ -25,7 +25,7 @@ from jaxonomy_dae import (
 )
 from jaxonomy_dae.learning import minimize
 from jaxonomy_dae.library import signal
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 
 @pytest.fixture(scope="module")

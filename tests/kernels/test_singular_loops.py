@@ -9,7 +9,7 @@ from rescaling import KINDS, rescaled
 
 import jaxonomy_dae.library.planar as pl
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, InitializationError, StructuralError
-from jaxonomy_dae.compiler.flatten import flatten
+from jaxonomy_dae.compile.passes.flatten import flatten
 
 POSITION = "Start elsewhere, with `initial={...}` or other parameters."
 

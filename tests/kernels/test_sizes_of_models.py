@@ -6,10 +6,10 @@ from problems import compiled
 from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv, der
-from jaxonomy_dae.initialization import rows, sparse_newton
-from jaxonomy_dae.model import consistent_point
-from jaxonomy_dae.model.consistent_point import initial_point
-from jaxonomy_dae.model.tables import Declared
+from jaxonomy_dae.compile.model import consistent_point
+from jaxonomy_dae.compile.model.consistent_point import initial_point
+from jaxonomy_dae.compile.model.tables import Declared
+from jaxonomy_dae.run.start import rows, sparse_newton
 
 
 class TwoGuesses(Component):

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
+from jaxonomy_dae.compile.model.opaque import OpaqueFunction
 from jaxonomy_dae.learning.coordinates import Coordinates
 from jaxonomy_dae.learning.evaluation import Evaluation, Weights
 from jaxonomy_dae.learning.evidence import Evidence, log_evidence
 from jaxonomy_dae.learning.factors import Factors
 from jaxonomy_dae.learning.smoothness import Bends, Law, directions, spread_out
-from jaxonomy_dae.model.opaque import OpaqueFunction
 
 
 class Polynomial(eqx.Module):

@@ -15,8 +15,8 @@ from jax.test_util import check_grads
 from problems import run
 
 from jaxonomy_dae import SimulationError
-from jaxonomy_dae.linear import sparse
-from jaxonomy_dae.linear.sparse import MissingSparseSolver, SparsePattern, solve_sparse, sparse_jacobian
+from jaxonomy_dae.solve.linear import sparse
+from jaxonomy_dae.solve.linear.sparse import MissingSparseSolver, SparsePattern, solve_sparse, sparse_jacobian
 from jaxonomy_dae.solvers import DAETerm, Rodas5P, solve_dae
 
 installed = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
@@ -258,7 +258,7 @@ def test_settings_are_left_alone():
     printed = run(
         "import jax\n"
         "import sys\n"
-        "from jaxonomy_dae.linear import sparse\n"
+        "from jaxonomy_dae.solve.linear import sparse\n"
         "assert 'klujax' not in sys.modules\n"
         "before = jax.config.values\n"
         "assert sparse.available() and 'klujax' not in sys.modules\n"

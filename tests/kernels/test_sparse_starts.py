@@ -9,10 +9,10 @@ import pytest
 from problems import compiled
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, der
-from jaxonomy_dae.initialization import initialize as initialization
-from jaxonomy_dae.initialization import sparse_newton
-from jaxonomy_dae.initialization.rows import initial_rows
-from jaxonomy_dae.lowering import schedule
+from jaxonomy_dae.compile.lowering import schedule
+from jaxonomy_dae.run.start import initialize as initialization
+from jaxonomy_dae.run.start import sparse_newton
+from jaxonomy_dae.run.start.rows import initial_rows
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
 N = 66  # cells: 132 unknowns

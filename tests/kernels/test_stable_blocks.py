@@ -16,10 +16,10 @@ from problems import compiled
 from shared_models import attenuator, levers
 
 from jaxonomy_dae import AcausalCompiler, Component, EqnEnv, der
-from jaxonomy_dae.linear.dense import solve_dense
-from jaxonomy_dae.linear.torn import solve_torn
-from jaxonomy_dae.linear.written_out import solve
-from jaxonomy_dae.structure.tearing import LINKS, BlockSizes, Tearing, tear
+from jaxonomy_dae.graph.structure.tearing import LINKS, BlockSizes, Tearing, tear
+from jaxonomy_dae.solve.linear.dense import solve_dense
+from jaxonomy_dae.solve.linear.torn import solve_torn
+from jaxonomy_dae.solve.linear.written_out import solve
 
 # --- the solver of torn blocks ------------------------------------------------------------------------------------
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxonomy_dae.solve.methods.field_size import LARGE, is_large
 from jaxonomy_dae.solvers import DAETerm, Rodas5P, Tsit5, solve_dae
-from jaxonomy_dae.solvers.field_size import LARGE, is_large
 
 TS = np.array([0.5, 1.0, 2.0])
 

@@ -8,8 +8,8 @@ from problems import compiled, pendulum
 from sympy import Eq, cos, sin
 
 from jaxonomy_dae import Component, EqnEnv, der
-from jaxonomy_dae.initialization.explicit import substitution
-from jaxonomy_dae.initialization.rows import initial_rows
+from jaxonomy_dae.run.start.explicit import substitution
+from jaxonomy_dae.run.start.rows import initial_rows
 
 
 def order(system, names=()):

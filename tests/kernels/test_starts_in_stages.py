@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.initialization.sizes import Sizes
-from jaxonomy_dae.initialization.stages import solve_in_stages
+from jaxonomy_dae.run.start.sizes import Sizes
+from jaxonomy_dae.run.start.stages import solve_in_stages
 
 
 @pytest.mark.parametrize("start", [[1.0, 1.0, 1.0, 1.0], [50.0, -3.0, 0.1, 7.0]])

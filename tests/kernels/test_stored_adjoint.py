@@ -14,7 +14,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jaxonomy_dae.programs.cache import compiled
+from jaxonomy_dae.host.cache import compiled
 from jaxonomy_dae.solvers import BDF, DAETerm, StoredAdjoint, Tsit5, solve_dae
 
 STORED, RECURSIVE = StoredAdjoint(), diffrax.RecursiveCheckpointAdjoint()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxonomy_dae.programs import threads
+from jaxonomy_dae.host import threads
 
 
 def test_large_work_has_all_threads():

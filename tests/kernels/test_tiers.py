@@ -11,9 +11,9 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from problems import run
 
-from jaxonomy_dae.programs import kept, tiers
-from jaxonomy_dae.programs.cache import ProgramCache
-from jaxonomy_dae.programs.compilations import compilations
+from jaxonomy_dae.host import kept, tiers
+from jaxonomy_dae.host.cache import ProgramCache
+from jaxonomy_dae.host.compilations import compilations
 
 
 def wave(x, k):
@@ -179,8 +179,8 @@ def test_programs_that_call_python_are_not_kept(tiered, folder):
 LEAVE = """
 import jax, jax.numpy as jnp
 jax.config.update("jax_enable_compilation_cache", False)
-from jaxonomy_dae.programs import tiers
-from jaxonomy_dae.programs.cache import ProgramCache
+from jaxonomy_dae.host import tiers
+from jaxonomy_dae.host.cache import ProgramCache
 tiers._chosen_by_the_user = lambda: False
 def many(x):
     for _ in range(60):

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.adjoint.ends import ending
-from jaxonomy_dae.simulation.wave_control import AtWaves
+from jaxonomy_dae.run.simulation.wave_control import AtWaves
+from jaxonomy_dae.solve.adjoint.ends import ending
 
 
 class Wishing(diffrax.AbstractAdaptiveStepSizeController):

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.linear.sparse import SparsePattern
-from jaxonomy_dae.linear.whole import LAPACK, solve_whole
+from jaxonomy_dae.solve.linear.sparse import SparsePattern
+from jaxonomy_dae.solve.linear.whole import LAPACK, solve_whole
 
 
 def ring(n: int):

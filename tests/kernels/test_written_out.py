@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.linear.written_out import solve
+from jaxonomy_dae.solve.linear.written_out import solve
 
 
 @pytest.mark.parametrize("n", [1, 2, 4, 6])

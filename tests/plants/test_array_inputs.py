@@ -22,7 +22,7 @@ from jaxonomy_dae import (
     steady_state,
     sweep,
 )
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.host.cache import PROGRAMS
 
 TS = jnp.linspace(0.0, 2.0, 9)
 T = np.asarray(TS)

@@ -24,7 +24,7 @@ from jaxonomy_dae import (
     smooth,
     steady_state,
 )
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 pytestmark = pytest.mark.long("a run with events, and often its gradient, is compiled for each law")

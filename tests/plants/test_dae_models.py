@@ -12,9 +12,9 @@ from problems import angle_solution, compiled, pendulum, without_lines
 from testset import PROBLEMS
 
 from jaxonomy_dae import Component, EqnEnv, ModelError, SimulationError, der, simulate
-from jaxonomy_dae.simulation.step_sizes import scaled_atol
+from jaxonomy_dae.run.simulation.step_sizes import scaled_atol
+from jaxonomy_dae.run.system.solver_choice import solver_choice
 from jaxonomy_dae.solvers import BDF, Rodas5P
-from jaxonomy_dae.system.solver_choice import solver_choice
 
 SOLVERS = pytest.mark.parametrize("solver", [BDF(), Rodas5P()], ids=["bdf", "rodas5p"])
 slow = pytest.mark.slow

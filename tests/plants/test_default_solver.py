@@ -11,8 +11,8 @@ from sympy import Eq
 from testset import PROBLEMS
 
 from jaxonomy_dae import Component, EqnEnv, SimulationError, assign, der, simulate
+from jaxonomy_dae.solve.methods.switching import STIFF
 from jaxonomy_dae.solvers import Rodas5P, Tsit5
-from jaxonomy_dae.solvers.switching import STIFF
 
 TS = np.array([0.5, 4.0, 10.0])
 

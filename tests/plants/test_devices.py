@@ -24,7 +24,7 @@ if count > 1:
     jax.distributed.initialize(f"127.0.0.1:{port}", count, rank)
 assert len(jax.devices()) == 2
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 
 class Tank(Component):

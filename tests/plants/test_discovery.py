@@ -16,9 +16,9 @@ from problems import compiled
 from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, NeuralDAEBlock, der, simulate
+from jaxonomy_dae.host.cache import PROGRAMS
 from jaxonomy_dae.learning import Experiment, IsotropicPassive, Odd, Passive, Problem, Unknown, powers, terms
 from jaxonomy_dae.library.planar import PlanarPendulum
-from jaxonomy_dae.programs.cache import PROGRAMS
 
 DRAG, RELEASE = 0.5, np.pi / 6
 TIMES = np.linspace(0.0, 6.0, 201)[1:]

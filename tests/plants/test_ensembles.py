@@ -9,10 +9,10 @@ import scipy.integrate
 from problems import compiled
 
 from jaxonomy_dae import EqnEnv, ModelError, simulate
+from jaxonomy_dae.host.cache import PROGRAMS
 from jaxonomy_dae.learning import Data, Experiment, IsotropicPassive, Problem, ensemble
 from jaxonomy_dae.learning.ensemble import _mixed
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 SIGMA, K = 0.01, 1.5
 TIMES = np.linspace(0.0, 4.0, 41)[1:]

@@ -15,8 +15,8 @@ import sympy
 from problems import compiled, component
 
 from jaxonomy_dae import ModelError, SimulationError, assign, der, pre, reinit, simulate, terminate
-from jaxonomy_dae.modeling import Eq
 from jaxonomy_dae.solvers import BDF
+from jaxonomy_dae.write import Eq
 
 TIGHT = dict(rtol=1e-10, atol=1e-10)
 G = 9.81

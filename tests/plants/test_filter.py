@@ -8,8 +8,8 @@ import scipy.optimize
 from kalman import discretized, held, negative_log_likelihood
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.host.cache import PROGRAMS
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 
 def compiled(component):

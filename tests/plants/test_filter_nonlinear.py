@@ -8,7 +8,7 @@ from sympy import Max, cos, sin
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
 from jaxonomy_dae.errors import ModelError
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from problems import compiled
 from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv, ModelError, der, simulate
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.host.cache import PROGRAMS
 from jaxonomy_dae.solvers import BDF, Rodas5P
 
 END = jnp.array([10.0])

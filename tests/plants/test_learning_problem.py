@@ -9,8 +9,8 @@ import pytest
 from swinging import DRAG, LENGTH, RELEASE, SIGMA, compiled_pendulum, record
 
 from jaxonomy_dae.errors import SimulationError
+from jaxonomy_dae.host.cache import PROGRAMS
 from jaxonomy_dae.learning import Data, Problem, Unknown
-from jaxonomy_dae.programs.cache import PROGRAMS
 
 
 def data(seed):

@@ -23,8 +23,8 @@ import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as line
 from jaxonomy_dae import Component, EqnEnv, SimulationError, der, simulate
 from jaxonomy_dae.library.contacts import DogClutch, HardStop, Rope
-from jaxonomy_dae.modeling import Eq
 from jaxonomy_dae.solvers import BDF, Rodas5P, StoredAdjoint
+from jaxonomy_dae.write import Eq
 
 TIGHT = dict(rtol=1e-10, atol=1e-10)
 ORIGIN = "some tens of tolerances of 1e-10"

@@ -13,7 +13,7 @@ from jaxonomy_dae import EqnEnv, ModelError, pre, reinit
 from jaxonomy_dae.errors import SimulationError
 from jaxonomy_dae.learning import Experiment, Filter, Planned, Problem, Unknown, design_experiment, next_experiment
 from jaxonomy_dae.learning.design import informations, known_of
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 pytestmark = pytest.mark.slow  # residuals and their Jacobian compile for ten seconds each
 

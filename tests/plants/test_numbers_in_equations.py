@@ -12,8 +12,8 @@ import scipy.integrate
 import sympy
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
-from jaxonomy_dae.compiler import lift_numbers
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.compile.passes import lift_numbers
+from jaxonomy_dae.write import Eq
 
 FORWARD = diffrax.ForwardMode()  # whose programs compile fastest, where nothing is differentiated
 N = 12

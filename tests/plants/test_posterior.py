@@ -13,10 +13,10 @@ from kalman import negative_log_likelihood
 from problems import compiled
 
 from jaxonomy_dae import EqnEnv, ModelError
+from jaxonomy_dae.host.cache import PROGRAMS
 from jaxonomy_dae.learning import Data, Experiment, Filter, Problem, Unknown, objective
 from jaxonomy_dae.learning import density as densities
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 needs_blackjax = pytest.mark.skipif(importlib.util.find_spec("blackjax") is None, reason="needs BlackJAX (extra bayes)")
 SIGMA, GUESS, SPREAD = 0.2, (1.0, -0.5), (0.3, 0.5)

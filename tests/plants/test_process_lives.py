@@ -11,7 +11,7 @@ from sympy import Eq
 
 import jaxonomy_dae
 from jaxonomy_dae import der, simulate
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.host.cache import PROGRAMS
 
 TS = np.array([0.3, 1.0])
 

@@ -15,8 +15,8 @@ from problems import compiled, drag_on, mlp, pendulum
 
 from jaxonomy_dae import AcausalSystem, EqnEnv, simulate
 from jaxonomy_dae.library import electrical as el
-from jaxonomy_dae.system.system_at import SystemAt
-from jaxonomy_dae.system.traced_once import traced_once
+from jaxonomy_dae.run.system.system_at import SystemAt
+from jaxonomy_dae.run.system.traced_once import traced_once
 
 
 def motor() -> AcausalSystem:

@@ -7,7 +7,7 @@ import pytest
 import sympy
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, compilations, der, simulate
-from jaxonomy_dae.programs import rows
+from jaxonomy_dae.host import rows
 
 N, TS = 60, jnp.linspace(0.0, 2.0, 30)
 

@@ -9,7 +9,7 @@ import scipy.integrate
 from problems import compiled, component
 
 from jaxonomy_dae import der, simulate
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 END, SAVED = 2.0, 1.9
 

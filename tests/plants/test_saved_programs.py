@@ -12,7 +12,7 @@ from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from problems import rc_circuit, rc_voltage, run
 
 from jaxonomy_dae import ModelError, load_compiled, save_compiled, simulate, solvers
-from jaxonomy_dae.simulation import saved_programs
+from jaxonomy_dae.run.simulation import saved_programs
 
 TS = np.linspace(0.0, 2.0, 3)
 READ = """

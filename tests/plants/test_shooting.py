@@ -13,8 +13,8 @@ import scipy.integrate
 from swinging import compiled_pendulum, record
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning, simulate
-from jaxonomy_dae.modeling import Component, Eq, der
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.host.cache import PROGRAMS
+from jaxonomy_dae.write import Component, Eq, der
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks" / "learning"))
 import double_pendulum  # noqa: E402

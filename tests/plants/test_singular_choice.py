@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 
 from jaxonomy_dae import Component, EqnEnv, SimulationError, der, simulate
 from jaxonomy_dae.library.planar import PlanarPendulum
-from jaxonomy_dae.modeling import Eq
 from jaxonomy_dae.solvers import BDF, Rodas5P, Tsit5
+from jaxonomy_dae.write import Eq
 
 TS = np.linspace(0.05, 2.0, 40)
 ANGLES = (0.5, 1.2, 2.5, -0.5, -1.2, -2.8)

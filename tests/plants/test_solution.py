@@ -12,7 +12,7 @@ from sympy import Eq
 from trajectories import solution_of
 
 from jaxonomy_dae import AcausalSystem, Component, EqnEnv, ModelError, SimulationError, Solution, der, simulate
-from jaxonomy_dae.simulation import solution as solution_module
+from jaxonomy_dae.run.simulation import solution as solution_module
 
 TS = jnp.array([0.0, 0.4, 1.1])
 
@@ -349,7 +349,7 @@ def test_a_model_of_zeros_is_observed():
 def test_quantities_are_read_in_blocks_of_times(monkeypatch):
     """Kind: what is read costs what was not asked for. One algebraic variable of a large model was all quantities at
     all times: 0.8 GB for 8 kB. Blocks give the same numbers, the last one shorter too."""
-    from jaxonomy_dae.programs import rows
+    from jaxonomy_dae.host import rows
 
     def write(self, ev):
         x, y, z = self.variable("x", start=1.0, fixed=True), self.variable("y"), self.variable("z")

@@ -9,8 +9,8 @@ import pytest
 from problems import compiled
 
 from jaxonomy_dae import Component, EqnEnv, der, simulate
-from jaxonomy_dae.modeling.events import EventFlag
-from jaxonomy_dae.simulation.hybrid_problem import problem_for
+from jaxonomy_dae.run.simulation.hybrid_problem import problem_for
+from jaxonomy_dae.write.events import EventFlag
 
 G = 9.81
 

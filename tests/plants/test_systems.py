@@ -21,7 +21,7 @@ import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.signal as sig
 import jaxonomy_dae.library.thermal as th
 from jaxonomy_dae import Component, Electrical, EqnEnv, frequency_response, linearize, steady_state
-from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.write import Eq
 
 ROUNDING = 1e-11  # of linear algebra with these small matrices
 

@@ -11,9 +11,9 @@ import pytest
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
 from jaxonomy_dae.errors import ModelError
+from jaxonomy_dae.host.cache import PROGRAMS
 from jaxonomy_dae.learning.gradient import Batches
-from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.write import POSITIVE, Component, Eq, der
 
 pytestmark = pytest.mark.slow  # residuals and their Jacobian compile for ten seconds, for each number of experiments
 

@@ -12,7 +12,7 @@ from problems import compiled
 from sympy import Eq, sin
 
 from jaxonomy_dae import Component, EqnEnv, assign, der, pre, simulate
-from jaxonomy_dae.programs.cache import PROGRAMS
+from jaxonomy_dae.host.cache import PROGRAMS
 
 pytestmark = pytest.mark.slow  # a dozen programs
 TS = jnp.linspace(0.0, 2.0, 5)

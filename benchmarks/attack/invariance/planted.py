@@ -52,7 +52,7 @@ def forgets(kind: str) -> Bend:
 
 
 def _by_names(_: Any) -> Any:
-    from jaxonomy_dae.model.identity import Identity
+    from jaxonomy_dae.compile.model.identity import Identity
 
     return property(lambda plan: Identity.of(tuple(plan.quantity_name)))
 
@@ -77,7 +77,7 @@ def _always_well(traced: Any) -> Any:
 
 
 def _looser_inside(controller: Any) -> Any:
-    from jaxonomy_dae.programs.staging import is_traced
+    from jaxonomy_dae.host.staging import is_traced
 
     def bent(system: Any, solver: Any, rtol: Any, atol: Any, *rest: Any) -> Any:
         factor = 1e6 if is_traced(system) else 1.0
@@ -87,7 +87,7 @@ def _looser_inside(controller: Any) -> Any:
 
 
 def _off_inside(with_parameters: Any) -> Any:
-    from jaxonomy_dae.programs.staging import is_traced
+    from jaxonomy_dae.host.staging import is_traced
 
     def bent(self: Any, values: Any) -> Any:
         return with_parameters(self, {n: v * (1 + 1e-4) if is_traced(v) else v for n, v in values.items()})

@@ -18,7 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ...errors import whole_number
+from ...base.errors import whole_number
 from .network import Sizes, divided, multiplied, sizes, tanh_network, typical
 
 REST = 0.01  # of the typical input: below it, |v| is rounded off, so that N is smooth at rest

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ...errors import ModelError, whole_number
+from ...base.errors import ModelError, whole_number
 
 if TYPE_CHECKING:
     Sizes: TypeAlias = float | Sequence[float] | np.ndarray  # one for all, or one for each

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ...errors import ModelError, whole_number
+from ...base.errors import ModelError, whole_number
 from .network import Sizes, divided, each, multiplied, sizes, tanh_network
 
 

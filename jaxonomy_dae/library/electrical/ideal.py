@@ -1,6 +1,6 @@
 """The ground, and ideal elements without storage: transformer, gyrator, amplifier."""
 
-from ...modeling import Component, Electrical, Eq, EqnEnv, Value
+from ...write import Component, Electrical, Eq, EqnEnv, Value
 from .two_pin import TwoPorts
 
 

@@ -1,6 +1,6 @@
 """Electrical machines: between circuits and shafts."""
 
-from ...modeling import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Rotational, Value, der
+from ...write import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Rotational, Value, der
 from ..rotational import Damper, FixedAngle, Inertia
 from .passive import Inductor, Resistor
 from .two_pin import TwoPin

@@ -2,7 +2,7 @@
 
 from sympy import Min, exp
 
-from ...modeling import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Thermal, Value, der, smooth
+from ...write import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Thermal, Value, der, smooth
 from ..arguments import start_of
 from .two_pin import TwoPin, TwoPorts
 

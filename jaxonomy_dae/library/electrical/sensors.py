@@ -1,6 +1,6 @@
 """Ideal meters: they take no power from the circuit."""
 
-from ...modeling import Component, Electrical, Eq, EqnEnv
+from ...write import Component, Electrical, Eq, EqnEnv
 from .two_pin import TwoPin
 
 

@@ -2,7 +2,7 @@
 
 import sympy
 
-from ...modeling import Eq, EqnEnv, Value
+from ...write import Eq, EqnEnv, Value
 from .. import waveforms
 from .two_pin import TwoPin, TwoPorts
 

@@ -3,7 +3,7 @@
 import sympy
 from sympy import And
 
-from ...modeling import NONNEGATIVE, Eq, EqnEnv, Value, assign
+from ...write import NONNEGATIVE, Eq, EqnEnv, Value, assign
 from ..arguments import yes_or_no
 from .two_pin import TwoPin
 

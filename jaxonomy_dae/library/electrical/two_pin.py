@@ -6,7 +6,7 @@ Conventions: potential `v` in volt, current `i` in ampere counted positive into 
 
 import sympy
 
-from ...modeling import Component, Electrical, Eq
+from ...write import Component, Electrical, Eq
 
 
 class TwoPin(Component):

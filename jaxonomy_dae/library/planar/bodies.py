@@ -2,7 +2,7 @@
 
 from sympy import cos, sin
 
-from ...modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Planar, Value, der
+from ...write import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Planar, Value, der
 from .joints import TwoFrames
 
 

@@ -2,7 +2,7 @@
 
 from sympy import sqrt
 
-from ...modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Planar, Value, der
+from ...write import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Planar, Value, der
 from ..arguments import yes_or_no
 from .joints import TwoFrames
 

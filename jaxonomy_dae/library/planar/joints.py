@@ -3,8 +3,8 @@
 import sympy
 from sympy import cos, sin
 
-from ...modeling import Component, Eq, EqnEnv, Planar, Rotational, Translational, Value, der
-from ...modeling.ports import Port
+from ...write import Component, Eq, EqnEnv, Planar, Rotational, Translational, Value, der
+from ...write.ports import Port
 from ..arguments import start_of
 
 

@@ -2,7 +2,7 @@
 
 from sympy import cos, sin
 
-from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
+from ...write import POSITIVE, Component, Eq, EqnEnv, Value, der
 
 
 class PlanarPendulum(Component):

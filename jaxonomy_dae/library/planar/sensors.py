@@ -2,7 +2,7 @@
 
 from sympy import cos, sin
 
-from ...modeling import Component, Eq, EqnEnv, Planar, der
+from ...write import Component, Eq, EqnEnv, Planar, der
 from .joints import TwoFrames
 
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from sympy import Max, Min
 
-from ...errors import ModelError
-from ...modeling import NONNEGATIVE, Component, EqnEnv, Value, smooth
+from ...base.errors import ModelError
+from ...write import NONNEGATIVE, Component, EqnEnv, Value, smooth
 from ..arguments import count, in_order, row
 
 

@@ -2,7 +2,7 @@
 
 from sympy import Expr, Max, Min, S, Symbol
 
-from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der, smooth
+from ...write import POSITIVE, Component, Eq, EqnEnv, Value, der, smooth
 from ..arguments import in_order
 
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import sympy
 
-from ...errors import ModelError
-from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, assign, pre
+from ...base.errors import ModelError
+from ...write import POSITIVE, Component, Eq, EqnEnv, Value, assign, pre
 from ..arguments import count, finite, in_order
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import sympy
 from numpy.typing import ArrayLike
 
-from ...errors import ModelError
-from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
+from ...base.errors import ModelError
+from ...write import POSITIVE, Component, Eq, EqnEnv, Value, der
 from ..arguments import count, finite, row, start_of
 
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from sympy import Expr, Max, Min
 
-from ...errors import ModelError
-from ...modeling import NONNEGATIVE, POSITIVE, Component, EqnEnv, Value
+from ...base.errors import ModelError
+from ...write import NONNEGATIVE, POSITIVE, Component, EqnEnv, Value
 from .. import waveforms
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 from sympy import floor
 
-from ...errors import ModelError
-from ...modeling import Component, Eq, EqnEnv
+from ...base.errors import ModelError
+from ...write import Component, Eq, EqnEnv
 from ..arguments import finite, increasing, yes_or_no
 from ..interpolation import known_kind
 

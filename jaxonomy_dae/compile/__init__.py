@@ -1,0 +1,1 @@
+"""From a diagram to a plan: the flat model, the passes, the lowering."""

@@ -1,0 +1,79 @@
+"""Sizes of quantities of which nothing is declared, by what their equations say."""
+
+import weakref
+
+import numpy as np
+from jaxtyping import Float
+
+from ...base.tolerances import KNOWN
+from ...graph.structure.integers import distinct
+from .declared import declared_scale
+from .extended import Extended
+from .jacobian import generic
+from .natural_sizes import Factors, natural_sizes
+from .quantities import ReducedModel
+
+MOVED = 1e-6  # of parameters: a difference from which a slope is told to six digits
+DECADES = 30  # that they may span: single precision has 38
+ROOM = 4  # answers kept for one model: at the values it was compiled with, at those it is run with, and two between
+
+
+def typical_sizes(
+    model: ReducedModel, parameters: Float[np.ndarray, " parameters"]
+) -> Float[np.ndarray, " quantities"]:
+    """The typical sizes of all quantities, at these values of the parameters; powers of two, by which numbers are
+    multiplied without rounding."""
+    return 2.0 ** np.round(np.log2(unrounded_sizes(model, parameters)))
+
+
+def unrounded_sizes(
+    model: ReducedModel, parameters: Float[np.ndarray, " parameters"]
+) -> Float[np.ndarray, " quantities"]:
+    """As `typical_sizes` before rounding to powers of two. State selection compares sizes, and rounding could turn a
+    small difference into a factor of two."""
+    return _balanced(model.extended, parameters, _declared_or_started(model, parameters))
+
+
+def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
+    """Nominal values, and else the largest starts; zero where there is none."""
+    size, starts = declared_scale(model), model.flat.variables.start
+    v = np.flatnonzero(starts.is_given & (model.variables.quantity >= 0))
+    values = starts.values(parameters)
+    # A start that is computed may be rounding alone, as L·sin(π) is; a number that is given is what it is.
+    moved = starts.values(parameters * (1 + MOVED * generic(np.random.default_rng(1), parameters.shape)))
+    values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
+    quantity, value = model.variables.quantity[v], values[v] / model.variables.factor[v]
+    tells = np.isfinite(value) & (value != 0.0) & (size[quantity] == 0.0)
+    np.maximum.at(size, quantity[tells], np.abs(value[tells]))
+    return size
+
+
+class _Balance:
+    """What was found for a model: other values of parameters that its equations do not read change nothing."""
+
+    def __init__(self, extended: Extended):
+        self.factors = Factors()
+        read = [group.parameter.ravel() for group in extended.groups]
+        self.read = distinct(np.concatenate([np.zeros(0, np.int64), *read]))
+        q = extended.quantities
+        lower = np.flatnonzero((q.owner[:-1] == q.owner[1:]) & (q.order[1:] == q.order[:-1] + 1))
+        self.rates = (lower, lower + 1) if len(lower) else None
+        self.found: dict[tuple[bytes, bytes], np.ndarray] = {}
+
+
+_BALANCES: weakref.WeakKeyDictionary[Extended, _Balance] = weakref.WeakKeyDictionary()
+
+
+def _balanced(extended: Extended, parameters: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Sizes that make terms alike, where `size` is zero."""
+    balance = _BALANCES.setdefault(extended, _Balance(extended))
+    key = size.tobytes(), parameters[balance.read].tobytes()
+    if key not in balance.found:
+        sizes, _ = natural_sizes(
+            extended.groups, extended.n_equations, size, parameters, rates=balance.rates, factors=balance.factors
+        )
+        while len(balance.found) >= ROOM:
+            balance.found.pop(next(iter(balance.found)), None)
+        balance.found[key] = 10.0 ** np.clip(np.log10(np.abs(sizes)), -DECADES, DECADES)
+        balance.found[key].flags.writeable = False
+    return balance.found[key]

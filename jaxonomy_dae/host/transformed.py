@@ -1,0 +1,350 @@
+"""A function of arrays that is compiled where values are known, and so are its derivatives and its batches.
+
+Under `jax.grad` and `jax.vmap` outside of jit, JAX would compile the derivative or the batch of a compiled function
+with all optimizations. Here both are functions of arrays again, and are compiled as the function itself is. The
+derivative in reverse mode is two programs: the values and all that the pullback needs, and the pullback. In forward
+mode it is one, and a batch of it for the directions of `jax.jacfwd`. Whatever else is at work (`jax.jit` around, arrays
+on several devices, `jax.debug_nans`), JAX transforms the function.
+"""
+
+from collections.abc import Callable, Hashable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import ShapedArray
+from jax.custom_derivatives import SymbolicZero
+
+from ..base.aliases import PyTree
+from ..base.private_names import MissingName, clear_jitted, private
+from .staging import is_staged, is_traced, kind, layers
+from .tiers import Program
+from .whole_records import WHOLE, numbered, whole_records
+
+
+class Function:
+    """`function(arrays)`, which returns any pytree, for arrays of certain shapes.
+
+    - `name`: what profiles and records show; `why`: what made it necessary.
+    - `runs_once`: its runs are expected to take less time than its compilation does.
+    - `identity`: a digest of what it computes, the same in every process (`lasting.py`); None if it has none.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[list[PyTree]], PyTree],
+        name: str,
+        why: str,
+        runs_once: bool,
+        identity: str | None = None,
+    ):
+        def run(arrays: list[Array]) -> PyTree:
+            return function(arrays)
+
+        run.__name__ = run.__qualname__ = name
+        self.function, self.name, self.why, self.runs_once, self.identity = function, name, why, runs_once, identity
+        self._transformed: Any = eqx.filter_jit(run)  # for what JAX transforms
+        self._program: Program | None = None
+        self._derived: dict[Hashable, Function] = {}
+        self.known = 0  # of `_pushed`: the first so many arrays are not directions
+        self.pulls = False  # a part of a derivative in reverse mode: what is derived from it has no identity
+
+    def __call__(self, arrays: list[Any]) -> PyTree:
+        arrays = [a if isinstance(a, jax.Array) else jax.device_put(a) for a in arrays]  # JAX' own kind of float
+        work = _at_work(arrays)
+        if work == "LinearizeTracer":
+            return self._differentiated(arrays)
+        if work == "JVPTracer":
+            return self._pushed(arrays)
+        if work == "BatchTracer":
+            return self._batched(arrays)
+        if work or not _is_plain(arrays):
+            return self._transformed(arrays)
+        if self._program is None:
+            self._program = Program(self.function, arrays, self.name, self.why, self.runs_once, self.identity)
+        return self._program(arrays) if self._program.stands_alone else self._transformed(arrays)
+
+    def regained(self) -> Any:
+        """The structure of the pullback that belongs to what a program from an earlier process returned.
+
+        **Raises:**
+
+        - `LostStructure` if that program would be another one now.
+        """
+        outcome = None if self._program is None else self._program.restaged()
+        if outcome is None:
+            raise LostStructure
+        structure, fixed, _ = outcome
+        return jax.tree.unflatten(structure, fixed)[2].structure.value
+
+    def forget(self) -> None:
+        """Lets go of a program from an earlier process: the next call traces it anew."""
+        self._program = self.identity = None
+
+    def clear(self) -> None:
+        """Frees what was compiled."""
+        clear_jitted(self._transformed)
+        self._program = None
+        for one in self._derived.values():
+            one.clear()
+        self._derived.clear()
+
+    def _derive(
+        self, key: Hashable, function: Callable[[list[PyTree]], PyTree], name: str, told: str | None = None
+    ) -> "Function":
+        """The derivative or batch of this key; in all processes, `told` tells it from others of this function."""
+        if key not in self._derived:
+            identity = None if told is None or self.identity is None or self.pulls else f"{self.identity} {told}"
+            self._derived[key] = Function(function, name, self.why, self.runs_once, identity)
+        return self._derived[key]
+
+    def _differentiated(self, arrays: list[Array]) -> PyTree:
+        """The outcome in reverse mode, with respect to the arrays that are traced."""
+        chosen = tuple(
+            k for k, a in enumerate(arrays) if is_traced(a) and jnp.issubdtype(a.dtype, jnp.inexact)
+        )  # fmt: skip
+        values = self._derive(
+            ("values", chosen), lambda arrays: _values(self.function, chosen, arrays), self.name, f"values {chosen}"
+        )
+        values.pulls = True
+        shape: list[PyTree] = []  # what the outcome is, beside its arrays
+
+        @jax.custom_vjp
+        def call(*arrays: Array) -> PyTree:
+            return values([*arrays])[0]
+
+        def forward(*given: PyTree) -> PyTree:
+            known = [one.value for one in given]
+            smooth, rest, pullback = values(known)
+            shape[:] = [rest]
+            return smooth, (pullback, known if pullback.structure.value is None else [])
+
+        def backward(residuals: tuple["_Pullback", list[Array]], cotangents: list[PyTree]) -> PyTree:
+            pullback, known = residuals
+            try:
+                return pulled_through(pullback, cotangents)
+            except LostStructure:
+                values.forget()
+                return pulled_through(values(known)[2], cotangents)
+
+        def pulled_through(residuals: "_Pullback", cotangents: list[PyTree]) -> PyTree:
+            # JAX would make arrays of zeros for what is not read, by a program for each shape.
+            read = tuple(not isinstance(c, SymbolicZero) for c in cotangents)
+            leaves, structure = residuals.leaves, residuals.structure
+            n = len(leaves)
+            whole = () if is_traced(leaves) else whole_records(leaves)
+
+            def pulled(arrays: list[Array]) -> list[PyTree]:
+                with WHOLE(whole):
+                    return pulled_back(arrays)
+
+            def pulled_back(arrays: list[Array]) -> list[PyTree]:
+                whole_structure = values.regained() if structure.value is None else structure.value
+                pullback = jax.tree.unflatten(whole_structure, arrays[:n])
+
+                def pulled_by(zeros: list[PyTree]) -> list[PyTree]:
+                    given = iter(arrays[n:])
+                    return list(pullback([next(given) if r else z for r, z in zip(read, zeros, strict=True)]))
+
+                try:
+                    return pulled_by([_zero_like(c) for c in cotangents])
+                except (TypeError, ValueError):  # JAX 0.10.2 takes a stacked zero of a scan for one of its steps
+                    return pulled_by([jnp.zeros(c.shape, c.dtype) for c in cotangents])
+
+            values.pulls = False
+            transpose = values._derive(
+                ("pullback", read, structure, whole), pulled, f"gradient of {self.name}", f"pullback {read} {whole}"
+            )
+            values.pulls = transpose.pulls = True
+            found = iter(transpose([*leaves, *(c for c, r in zip(cotangents, read, strict=True) if r)]))
+            return tuple(next(found) if k in chosen else None for k in range(len(arrays)))
+
+        call.defvjp(forward, backward, symbolic_zeros=True)
+        smooth = call(*arrays)
+        return _combined(smooth, shape[0])
+
+    def _pushed(self, arrays: list[Array]) -> PyTree:
+        """The outcome in forward mode, with respect to the arrays that are traced."""
+        chosen = tuple(k for k, a in enumerate(arrays) if is_traced(a))
+        n = len(arrays)
+
+        def along(arrays: list[Array]) -> PyTree:
+            """(Values, the outcome without them), their derivatives along the last arrays."""
+            split: list[PyTree] = []
+
+            def of(*moved: Array) -> PyTree:
+                given = list(arrays[:n])
+                for k, value in zip(chosen, moved, strict=True):
+                    given[k] = value
+                smooth, rest = eqx.partition(self.function(given), eqx.is_inexact_array)
+                others, fixed = eqx.partition(rest, eqx.is_array)
+                split[:] = [jax.tree.structure(smooth), fixed]
+                return jax.tree.leaves(smooth), others
+
+            smooth, slopes, others = jax.jvp(of, [arrays[k] for k in chosen], arrays[n:], has_aux=True)
+            structure, fixed = split
+            return (smooth, (_Static(structure), eqx.combine(others, fixed))), slopes
+
+        pushed = self._derive(
+            ("tangents", chosen), along, f"derivative of {self.name}", f"tangents {chosen}"
+        )  # fmt: skip
+        pushed.known = n
+        rest: list[PyTree] = []
+
+        @jax.custom_jvp
+        def call(*moved: Array) -> PyTree:
+            raise AssertionError  # JAX calls the rule below
+
+        @call.defjvp
+        def _(moved: PyTree, tangents: PyTree) -> PyTree:
+            given = list(arrays)
+            for k, value in zip(chosen, moved, strict=True):
+                given[k] = value
+            (smooth, rest[:]), slopes = pushed([*given, *tangents])
+            return smooth, slopes
+
+        smooth = call(*(arrays[k] for k in chosen))
+        return _combined(smooth, (rest[0], rest[1]))
+
+    def _batched(self, arrays: list[Any]) -> Any:
+        """The outcome under one `jax.vmap` of known values."""
+        axes = [getattr(a, "batch_dim", None) for a in arrays]
+        values = [[*layers(a)][-1] for a in arrays]
+        k = next(k for k, axis in enumerate(axes) if axis is not None)
+        size = values[k].shape[axes[k]]
+
+        # In `jax.jacfwd`, members differ in their directions alone, and JAX asks for one value of the function.
+        alike = 0 < self.known and all(axis is None for axis in axes[: self.known])
+
+        def many(arrays: list[Array]) -> PyTree:
+            fixed: list[PyTree] = []
+
+            def one(*arrays: Array) -> PyTree:
+                moving, rest = eqx.partition(self.function([*arrays]), eqx.is_array)
+                fixed[:] = [rest]
+                return moving
+
+            moving = jax.vmap(one, in_axes=axes, axis_size=size)(*arrays)
+            if alike:
+                moving = (jax.tree.map(lambda rows: rows[0], moving[0]), moving[1])
+            return moving, fixed[0]
+
+        told = f"batch {size} {axes} {self.known}"
+        moving, rest = self._derive(("batch", size, tuple(axes)), many, f"batch of {self.name}", told)(values)
+        differs = jax.tree.map(lambda rows: True, moving)
+        if alike:
+            differs = (jax.tree.map(lambda value: False, moving[0]), differs[1])
+
+        @jax.custom_batching.custom_vmap
+        def member(_: object) -> PyTree:
+            shapes = jax.tree.map(lambda rows, some: rows.shape[some:], moving, differs)
+            return jax.tree.map(lambda rows, shape: jnp.zeros(shape, rows.dtype), moving, shapes)
+
+        @member.def_vmap
+        def members(size: int, is_batched: PyTree, _: object) -> PyTree:
+            return moving, differs
+
+        return eqx.combine(member(arrays[k]), rest)
+
+
+class LostStructure(Exception):
+    """The structure of a pullback is needed, and the program that made its arrays cannot be traced again."""
+
+
+class _Structure:
+    """The structure of a pullback: programs, which are not written to files. There, `value` is None."""
+
+    def __init__(self, value: Any = None):
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Structure) and self.value == other.value
+
+    def __hash__(self) -> int:
+        return hash(self.value)
+
+    def __reduce__(self):
+        return _Structure, ()
+
+
+class _Pullback(eqx.Module):
+    """The arrays of a pullback, and its structure."""
+
+    leaves: list[PyTree]
+    structure: _Structure = eqx.field(static=True)
+
+
+def _values(function: Callable[[list[PyTree]], PyTree], chosen: tuple[int, ...], arrays: list[Array]) -> PyTree:
+    """The inexact arrays of the outcome in a list, the outcome without them, and the pullback."""
+
+    def of(*moved: PyTree) -> PyTree:
+        given = list(arrays)
+        for k, value in zip(chosen, moved, strict=True):
+            given[k] = value
+        smooth, rest = eqx.partition(function(given), eqx.is_inexact_array)
+        others, fixed = eqx.partition(rest, eqx.is_array)
+        shape[:] = [jax.tree.structure(smooth), fixed]
+        return jax.tree.leaves(smooth), others
+
+    shape: list[PyTree] = []
+    with numbered():
+        smooth, pullback, others = jax.vjp(of, *(arrays[k] for k in chosen), has_aux=True)
+    structure, fixed = shape
+    leaves, of_pullback = jax.tree.flatten(pullback)
+    return smooth, (_Static(structure), eqx.combine(others, fixed)), _Pullback(leaves, _Structure(of_pullback))
+
+
+class _Static(eqx.Module):
+    """A structure that passes through compiled programs."""
+
+    structure: Any = eqx.field(static=True)
+
+
+def _combined(smooth: list[PyTree], rest: tuple[_Static, PyTree]) -> PyTree:
+    return eqx.combine(jax.tree.unflatten(rest[0].structure, smooth), rest[1])
+
+
+_SOMETHING = np.zeros((), bool)
+
+
+def _at_work(arrays: list[Array]) -> str:
+    """The kind of tracer that wraps the others, if these wrap values; "other" if that is not one of two that are
+    dealt with, or cannot be told; "" if nothing is traced."""
+    if not is_traced(arrays):
+        return ""
+    if is_staged(arrays):
+        return "other"
+    kinds = [tuple(map(kind, layers(a)))[:-1] for a in arrays]
+    deepest = max(kinds, key=len)
+    # All others must be wrapped by the same, or by what it wraps.
+    if any(kind != deepest[len(deepest) - len(kind) :] and kind[:1] != deepest[:1] for kind in kinds):
+        return "other"
+    if deepest[0] == "LinearizeTracer" or deepest == ("BatchTracer",):
+        return deepest[0]
+    # Numbers that are not differentiable have a derivative of a type of its own, which programs do not take.
+    if deepest == ("JVPTracer",) and all(jnp.issubdtype(a.dtype, jnp.inexact) for a in arrays if is_traced(a)):
+        return deepest[0]
+    return "other"
+
+
+def _is_plain(arrays: list[Array]) -> bool:
+    """True if a program may be called as it is: arrays lie on one device, and nothing asks JAX for more checks."""
+    config: Any = jax.config
+    if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs or config.jax_check_tracer_leaks:
+        return False
+    if len({d for a in arrays for d in a.devices()}) > 1:
+        return False
+    # Inside another program, what is computed becomes a part of it, also where no argument is traced.
+    return not is_staged(jax.device_put(_SOMETHING))
+
+
+def _zero_like(cotangent: PyTree) -> PyTree:
+    """The cotangent of what is not read: not an array of zeros, which would be computed with, and times infinity
+    is not a number."""
+    try:
+        return private("Zero")(ShapedArray(cotangent.shape, cotangent.dtype))
+    except MissingName:
+        return jnp.zeros(cotangent.shape, cotangent.dtype)

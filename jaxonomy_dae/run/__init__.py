@@ -1,0 +1,1 @@
+"""A system at a point, its start, its trajectory."""

@@ -1,0 +1,101 @@
+"""Newton's method for batches of small systems, and the verdict that ends it."""
+
+import functools
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ...base.tolerances import NOISE, ZERO_WITHIN, spacing
+from ...solve.linear.arrays import Scalar
+from ...solve.linear.dense import solve_dense
+from ...solve.linear.newton import Tried, newton
+from ...solve.linear.written_out import UNROLLED, solve
+
+NEWTON_STEPS = 120  # to the root of a nonlinear block, at most, halvings included; a double root takes 27
+SURE = 1e-6  # residuals so small, relative to their terms at the start, need not fall: rounding has a part in them
+
+
+def is_small(
+    residual: Array,
+    terms: Array,
+    partials: Sequence[Scalar],
+    typical: Sequence[Scalar],
+    tolerated: float,
+    noise: Sequence[Scalar] = (),
+) -> Array:
+    """True if a residual is small beside its terms, or beside the rounding of what it is computed from.
+
+    **Arguments:**
+
+    - `terms`: the magnitude of its terms.
+    - `partials`, `typical`, `noise`: its partial derivatives by slots; the typical sizes of these; and what rounding
+        may have left in them beyond their own.
+    """
+    eps = spacing(jnp.result_type(residual))
+    pairs = list(zip(partials, typical, strict=False))  # of a network, its output alone
+    floor = _weighed([(p, s) for p, s in pairs if not _is_nothing(s)])
+    left = _weighed([(p, n) for p, n in zip(partials, noise, strict=False) if not _is_nothing(n)])
+    allowed = tolerated * terms + ZERO_WITHIN * eps * floor + NOISE * left
+    # Where a slope is infinite, as that of a root at zero, the equation holds exactly or not at all.
+    return (jnp.abs(residual) <= allowed) & ((allowed < jnp.inf) | (residual == 0))
+
+
+def _weighed(pairs: Sequence[tuple[Scalar, Scalar]]) -> Scalar:
+    """Σ |a|·b."""
+    return sum((abs(a) * b for a, b in pairs), 0.0)
+
+
+def _is_nothing(value: Scalar) -> bool:
+    """True if a value is the Python number 0.0, known while a program is traced."""
+    return isinstance(value, float) and value == 0.0
+
+
+def find_root(
+    holds: Callable[[list[Array]], Array],
+    stepped: Callable[[list[Array]], tuple[list[Array], list[Array]]],
+    differentiable: Callable[[list[Array]], list[Array]],
+    sizes: list[Array],
+    z: list[Array],
+    batch: tuple[int, ...],
+) -> tuple[list[Array], Array]:
+    """Newton's method from z until all `holds`, one verdict for each of a batch of problems; and the verdicts.
+
+    `stepped` gives the residuals and the step. A step is halved until the largest residual falls, relative to the
+    `sizes` of their terms at the start: whole steps go back and forth between the branches of a law with a kink.
+
+    The search is not differentiated; two steps of the `differentiable` correction follow, written out.
+    """
+    z, sizes = jax.lax.stop_gradient((z, sizes))
+
+    def look(z, part, least):
+        residuals, step = stepped(z)
+        off = [jnp.abs(r) / jnp.where(s > 0, s, 1) for r, s in zip(residuals, sizes, strict=True)]
+        largest = functools.reduce(jnp.maximum, off)
+        largest = jnp.max(largest) if len(batch) < jnp.ndim(largest) else largest
+        falls = (largest <= (1 - part / 4) * least) | (least <= SURE)
+        return Tried(falls, holds(z), step, largest)
+
+    found = newton(look, z, jnp.full(batch, jnp.inf, z[0].dtype), NEWTON_STEPS, batch=batch)
+    z = jax.lax.stop_gradient(found.x)
+    for _ in range(2):
+        z = differentiable(z)
+    return z, jnp.asarray(found.holds)
+
+
+def newton_step(residuals: Callable[[list[Array]], list[Array]], z: list[Array]) -> tuple[list[Array], list[Array]]:
+    """(r(z), a Newton step), for lists of arrays of one shape (a batch of problems); exact if r is affine."""
+    m = len(z)
+    if m <= UNROLLED:
+        value, push = jax.linearize(residuals, z)
+        columns = [push([jnp.ones_like(a) if j == k else jnp.zeros_like(a) for j, a in enumerate(z)]) for k in range(m)]
+        step = solve([[column[r] for column in columns] for r in range(m)], value)
+        return value, [-d for d in step]
+    stacked = jnp.stack(z)
+    value, push = jax.linearize(lambda v: jnp.stack(residuals(list(v))), stacked)
+    basis = jnp.eye(m, dtype=stacked.dtype).reshape(m, m, *([1] * z[0].ndim))
+    columns = jax.vmap(push)(jnp.broadcast_to(basis, (m, *stacked.shape)))  # (unknown, equation, *batch)
+    matrix = jnp.moveaxis(columns, (1, 0), (-2, -1))
+    step = solve_dense(matrix, jnp.moveaxis(value, 0, -1))
+    return list(value), list(-jnp.moveaxis(step, -1, 0))

@@ -1,0 +1,1 @@
+"""Equations that no component wrote: linear and nonlinear solves, steps, their adjoint, events."""

@@ -1,0 +1,245 @@
+"""What happens at one instant: events one after another, each a map at a frozen time.
+
+A step ends at a time t₁ that counts as a constant. The event happens at τ = t₁ + δ with δ = −g/ġ, zero but for
+rounding; its derivative is that of the time of the crossing, by the implicit function theorem. The map
+
+    xₑ = x₁ + f⁻·δ,   (x⁺, q⁺) = R(τ, xₑ, q),   x₁' = x⁺ − f⁺·δ
+
+has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its derivative (Aizerman & Gantmacher 1958). Its
+second derivative is not that of the flow, and is refused. A clock ticks at τ = offset + k·period, a function of
+parameters, in the same manner.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from ...base.aliases import Args, Time
+from ...write.events import EventFlag
+from ..adjoint.closure_conversion import any_member
+from .after_event import aftermath
+from .instant import Arrival, Happening, Instant, is_zero
+from .log import EventRows
+from .problem import AbstractHybridProblem, HybridState, one_hot
+from .rivals import Rivals
+from .side import BELOW, RESTS
+
+CONDITIONS_AT_ONE_INSTANT = 32  # if more events are due, the rest happen in another step, which is as good as none
+# How often guards may fall while time does not go on, beside so often for each. Beyond, relations turn back and forth,
+# or conditions make each other true without end.
+SLIDES, TURNS = 64, 4
+
+
+def most_at_once(problem: AbstractHybridProblem) -> int:
+    """The largest number of events that can be listed at one instant."""
+    return _most_in_turn(problem) * max(int(problem.facts.are(EventFlag.STRIKE).sum()), 1)
+
+
+def _most_in_turn(problem: AbstractHybridProblem) -> int:
+    return problem.facts.n_clocks + min(2 * problem.facts.n_guards, CONDITIONS_AT_ONE_INSTANT)
+
+
+def handle(
+    problem: AbstractHybridProblem, t: Time, state: HybridState, arrival: Arrival, args: Args, noted: EventRows,
+    at_start: bool = False,
+) -> tuple[HybridState, Array, EventRows]:  # fmt: skip
+    """Returns (the state after all events of an instant, dx/dt there, `noted` with the events that are listed).
+
+    At the initial time, `at_start`, events do not move with parameters, and are logged only if they end the run.
+    """
+    events = _Events.of(problem, t, state, arrival, args, at_start)
+    start = Instant(
+        state=state, left=arrival.due, caused=arrival.jumped, delay=jnp.zeros_like(t), round=arrival.due,
+        before=state.x, approach=arrival.slope, previous=state.q, slope=arrival.slope, arrived=state.x,
+        stuck=jnp.zeros((problem.facts.n_guards,), bool), noted=noted, wrote=events.rivals.nobody,
+    )  # fmt: skip
+    length = _most_in_turn(problem)
+    # Loops of fixed length, whose bodies are skipped where nothing is left: reverse mode cannot go back over a `while`.
+    # Of a thousand clocks, few tick at once: loops in a loop pass over the others in √1000 steps.
+    inner = max(math.isqrt(length), min(length, CONDITIONS_AT_ONE_INSTANT))
+    handled = _while_any_is_left(events.after_next, inner)
+    if length > inner:
+        handled = _while_any_is_left(handled, -(-length // inner))
+    instant = handled(start)
+    return instant.state, instant.slope, instant.noted
+
+
+class _Events(NamedTuple):
+    """What the events of one instant share: the time, at which the step ends; what is due; `first`, the events that
+    were listed before; and what events are, by their numbers."""
+
+    problem: AbstractHybridProblem
+    t: Time
+    arrival: Arrival
+    args: Args
+    at_start: bool
+    first: Array
+    rivals: Rivals
+    listed: np.ndarray
+    ends: Array
+    relations: Array
+    strikes: Array
+    waits: Array | np.ndarray
+
+    @staticmethod
+    def of(
+        problem: AbstractHybridProblem, t: Time, state: HybridState, arrival: Arrival, args: Args, at_start: bool
+    ) -> "_Events":
+        """The events of the instant t at which a step arrives."""
+        facts = problem.facts
+        c, g = facts.n_clocks, facts.n_guards
+        # At the initial time, a guard that is zero and begins to fall has its event in the first step, not now.
+        waits = (arrival.size == 0) & (arrival.rate < 0) & ~arrival.due[c:] if at_start else np.zeros(g, bool)
+        return _Events(
+            problem=problem, t=t, arrival=arrival, args=args, at_start=at_start, first=state.count,
+            rivals=Rivals.of(facts), listed=facts.are(EventFlag.LISTED) & (np.arange(c + g) >= c) & (not at_start),
+            ends=jnp.asarray(facts.ends).astype(t.dtype), relations=jnp.asarray(facts.are(EventFlag.RELATION)),
+            strikes=jnp.asarray(facts.are(EventFlag.STRIKE)), waits=waits,
+        )  # fmt: skip
+
+    @property
+    def several(self) -> bool:
+        """True if events may strike together."""
+        return bool(self.problem.facts.are(EventFlag.STRIKE).sum() > 1)
+
+    def after_next(self, instant: Instant) -> Instant:
+        """The instant after the next event, or the next ones that strike together."""
+        problem, t, arrival, args, rivals = self.problem, self.t, self.arrival, self.args, self.rivals
+        c, g = problem.facts.n_clocks, problem.facts.n_guards
+        state, q = instant.state, instant.state.q
+        # Where nothing is left, as in some members of a batch, nothing happens: derivatives of what would have happened
+        # need not be finite.
+        goes_on = jnp.any(instant.round & instant.left)
+        together = instant.left & (instant.round | ~goes_on)
+        base, base_slope, previous = (
+            jnp.where(goes_on, kept, now)
+            for kept, now in ((instant.before, state.x), (instant.approach, instant.slope), (instant.previous, q))
+        )
+        now = self._happening(instant, jnp.where(jnp.any(together), jnp.argmax(together), c + g))
+        event, delay = now.event, now.delay
+        time, reached = t + delay, state.x + instant.slope * delay
+        x, written = problem.written(time, reached, base + base_slope * delay, q, previous, now.these, args)
+        now = now._replace(moved=jnp.any(x != reached) & ~self.relations[event])
+        after = aftermath(problem, t, x, written, instant, arrival, now, args)
+        ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
+        turns = state.turns + (~now.is_clock).astype(t.dtype)
+        again = self._again(now, after.stuck, turns)
+        wrote = instant.wrote
+        if rivals.places:
+            both = jnp.concatenate([reached, q]), jnp.concatenate([x, written])
+            clash, wrote = rivals.after(event, *both, jnp.where(goes_on, wrote, rivals.nobody))
+            again = jnp.where(clash < -1, clash, jnp.where(state.stuck < -1, state.stuck.astype(int), again))
+        # States whose slope changes during the delay, for example a current that a blocked diode stops, are not
+        # followed back over it: they keep the value after the event.
+        back = delay - (1.0 - after.slow) * lax.stop_gradient(delay)
+        logged = now.these & (self.listed | (self.ends > 0))
+        sides = jnp.concatenate([reached, q]), jnp.concatenate([x, after.q])
+        return Instant(
+            state=state.but(
+                x=x - after.slope * back,
+                q=after.q,
+                armed=after.armed,
+                ticks=ticks,
+                due=lax.stop_gradient(problem.due(ticks)),
+                count=state.count + jnp.sum(logged).astype(state.count.dtype),
+                ended=jnp.maximum(state.ended, jnp.max(jnp.where(now.these, self.ends, 0.0))),
+                stuck=again.astype(t.dtype),
+                turns=turns,
+            ),
+            left=after.left,
+            caused=after.caused,
+            delay=delay,
+            round=together,
+            before=base,
+            approach=base_slope,
+            previous=previous,
+            slope=after.slope,
+            arrived=instant.arrived,
+            stuck=after.stuck,
+            noted=self._noted(instant, now, logged, time, sides),
+            wrote=wrote,
+        )
+
+    def _happening(self, instant: Instant, event: Array) -> Happening:
+        """The event, when it happens, and what happens with it; whether it writes states is not known yet."""
+        problem, state = self.problem, instant.state
+        c, g = problem.facts.n_clocks, problem.facts.n_guards
+        is_clock = event < c
+        delay, rates = jnp.zeros_like(self.t), self.arrival.rate
+        rose = onto = jnp.zeros((g,), bool)
+        if g and not self.at_start:
+            crossing, rates, rose, onto = _crossing(self, instant, event)
+            delay = jnp.where(is_clock, delay, crossing)
+        if c and not self.at_start:
+            exact = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
+            delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
+        # Parts that strike at the same instant do so at once, whatever the order: a box that falls flat does not turn.
+        # All share the δ of the first: if a parameter parts their instants, the derivative is one-sided, as at any
+        # kink.
+        these = one_hot(event, c + g)
+        if self.several:
+            these = these | (instant.left & self.strikes & self.strikes[event])
+        return Happening(
+            event=event, is_clock=is_clock, these=these, delay=delay, rates=rates, moved=np.False_,
+            approach=jnp.where(instant.caused | self.at_start, 0.0, rates), rose=rose, onto=onto, waits=self.waits,
+        )  # fmt: skip
+
+    def _again(self, now: Happening, stuck: Array, turns: Array) -> Array:
+        """The number of an event that happens again and again at this instant, or −1."""
+        c, g = self.problem.facts.n_clocks, self.problem.facts.n_guards
+        if not g:
+            return jnp.array(-1)
+        slides = ~now.is_clock & (turns > SLIDES + TURNS * g)
+        return jnp.where(slides, now.event, jnp.where(jnp.any(stuck), c + jnp.argmax(stuck), -1))
+
+    def _noted(
+        self, instant: Instant, now: Happening, logged: Array, time: Time, sides: tuple[Array, Array]
+    ) -> EventRows:
+        """The rows of this instant with those of events that are logged."""
+        c, n = self.problem.facts.n_clocks, len(logged)
+        shown = jnp.arange(n) if self.several else now.event[None]
+        row = (instant.state.count - self.first).astype(int) + jnp.cumsum(logged[shown]) - 1
+        row = jnp.where(logged[shown], row, instant.noted.log.shape[0])
+        rate = jnp.concatenate([jnp.zeros((c,), self.t.dtype), now.rates])[shown]
+        return instant.noted.written(row, time, shown, rate, *sides)
+
+
+def _crossing(events: _Events, instant: Instant, event: Array) -> tuple[Time, Array, Array, Array]:
+    """Returns (δ of the event if it is one of a condition, the rates of the guards before it, the guards that have just
+    risen to zero, those that have jumped onto zero)."""
+    problem, t, arrival, args, relations = events.problem, events.t, events.arrival, events.args, events.relations
+    c, g, state = problem.facts.n_clocks, problem.facts.n_guards, instant.state
+    k = jnp.clip(event - c, 0, max(g - 1, 0))
+    values = problem.guards(t, state.x, state.q, args)
+    value, rates = problem.rates(t, state.x, state.q, args, instant.slope)
+    # A guard that has just risen to zero would be above it but for this event: it falls if the event turns it back. A
+    # relation has an opposite, which falls then.
+    rose = (state.armed == BELOW) & is_zero(value, rates, arrival) & (rates > 0) & ~relations[c:]
+    # A condition whose guard has jumped onto zero and does not move there is true unless it is strict.
+    onto = arrival.jumped & (value == 0) & (rates == 0) & ~problem.facts.are(EventFlag.STRICT)[c:]
+    crossing = -values[k] / jnp.where(rates[k] == 0, 1.0, rates[k])
+    # Where another event has made the guard slow, rounding is all that is left of its value.
+    frozen = lax.stop_gradient(crossing)
+    crossing = crossing + (jnp.clip(frozen, -arrival.window, arrival.window) - frozen)
+    # A guard that rested falls where it leaves the band, perhaps so slowly that its slope is another one at zero.
+    crossing = crossing - jnp.where(state.armed[k] == RESTS, lax.stop_gradient(crossing), 0.0)
+    return jnp.where(instant.caused[k], instant.delay, crossing), rates, rose, onto
+
+
+def _while_any_is_left(step: Callable[[Instant], Instant], times: int) -> Callable[[Instant], Instant]:
+    """The step repeated so many times; it is skipped where no event is left."""
+
+    def once(instant: Instant, _: None) -> tuple[Instant, None]:
+        going = jnp.any(instant.left)
+
+        def go(instant: Instant) -> Instant:
+            return jax.tree.map(lambda a, b: jnp.where(going, a, b), step(instant), instant)
+
+        return lax.cond(any_member(going), go, lambda instant: instant, instant), None
+
+    return lambda instant: lax.scan(once, instant, length=times)[0]

@@ -1,0 +1,138 @@
+"""Any solver, with steps that end at events."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from ...base.aliases import PyTree, Result, State, Time
+from ..adjoint.appended import NOTED, apart, appended, together
+from ..adjoint.closure_conversion import any_member
+from ..methods.wrapped import WrappedSolver
+from .event_map import handle, most_at_once
+from .kinks import turned
+from .log import EventRows
+from .looking import looked_at
+from .problem import HybridState, bound, problem_of
+
+MOVED = 1e3  # times the resolution: with a longer step time has gone on, and turns at one instant are counted anew
+
+TOO_MANY: Result = diffrax.RESULTS.max_steps_rejected  # events
+STUCK: Result = diffrax.RESULTS.stagnation  # an event happens again and again at one instant
+CLASH: Result = diffrax.RESULTS.conlim  # two events give one variable different values at one instant
+NOT_FINITE: Result = diffrax.RESULTS.nonlinear_divergence  # what an event wrote
+
+
+class HybridInterpolation(diffrax.AbstractLocalInterpolation):
+    """Dense output of a step: x by the inner solver's dense output within the step, by the state after the events at
+    its end."""
+
+    t0: Time
+    t1: Time
+    inner: Any
+    y0: HybridState
+    y1: HybridState
+    fired: Array
+    slope: Array
+    resolution: Time
+    noted: EventRows  # the events at its end that are listed
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
+        # Times within rounding of the event are those of the event; one that moves goes along the solution after it.
+        at_end = self.fired & (t0 >= self.t1 - self.resolution)
+        after = self.y1.x + self.slope * (t0 - lax.stop_gradient(self.t1))
+        x = jnp.where(at_end, after, self.inner(self.t0, self.t1, t0))
+        q, armed, ticks = (
+            jnp.where(at_end, getattr(self.y1, part), getattr(self.y0, part)) for part in ("q", "armed", "ticks")
+        )
+        return self.y1.but(x=x, q=q, armed=armed, ticks=ticks)
+
+
+class _DenseOutput(eqx.Module):
+    """The inner solver's dense output."""
+
+    interpolation: Any = eqx.field(static=True)
+    info: PyTree
+
+    def __call__(self, t0: Time, t1: Time, t: Time) -> State:
+        return self.interpolation(t0=t0, t1=t1, **self.info).evaluate(t)
+
+
+class WithEvents(WrappedSolver):
+    """Wraps a solver so that steps end where an event happens.
+
+    - `solver`: the problem prepares it for the discrete values at hand.
+    - `max_events`: more of them end the run with `TOO_MANY`.
+    - `room`: how many of them are listed; `sides`: with the states before and after them.
+    """
+
+    solver: diffrax.AbstractSolver
+    max_events: int = eqx.field(static=True)
+    room: int = eqx.field(static=True, default=0)
+    sides: bool = eqx.field(static=True, default=False)
+
+    term_structure = diffrax.AbstractTerm
+    interpolation_cls = HybridInterpolation  # pyright: ignore[reportAssignmentType]
+
+    @property
+    def term_compatible_contr_kwargs(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return {}
+
+    def func(self, terms, t0, y0, args):
+        if isinstance(y0, HybridState):
+            return self.solver.func(bound(terms, y0.q), t0, y0.x, args)
+        return self.solver.func(terms, t0, y0, args)
+
+    def between_events(self, terms, y0, y1):
+        """Returns (terms, solver, state, whether an event at its end changed them) after a step from y0 to y1."""
+        solver = problem_of(terms).prepared(self.solver, y1.q)
+        return bound(terms, y1.q), solver, y1.x, jnp.any(y0.q != y1.q)
+
+    def init(self, terms, t0, t1, y0, args):
+        solver = problem_of(terms).prepared(self.solver, y0.q)
+        return solver.init(bound(terms, y0.q), t0, t1, y0.x, args), jnp.array(False)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        problem = problem_of(terms)
+        y0, table = apart(y0)
+        inner_state, jumped = solver_state
+        made_jump = jumped if made_jump is False else made_jump | jumped
+        solver = problem.prepared(self.solver, y0.q)
+        x1, y_error, info, inner_state, result = solver.step(
+            bound(terms, y0.q), t0, t1, y0.x, args, inner_state, made_jump
+        )
+        dense = _DenseOutput(solver.interpolation_cls, info)
+        request, armed, values, arrival = looked_at(problem, dense, t0, t1, y0, x1, args)
+        turns = jnp.where(t1 - t0 > MOVED * problem.resolution, jnp.zeros_like(y0.turns), y0.turns)
+        state = y0.but(x=x1, armed=armed, size=arrival.size, span=arrival.span, request=request, turns=turns)
+        fired = jnp.any(arrival.due)
+
+        noted = EventRows.empty(
+            min(self.room, most_at_once(problem)), self.sides, len(y0.x) + len(y0.q), jnp.result_type(t1)
+        )
+        none = jnp.zeros_like(x1), noted
+
+        def events(state):
+            return handle(problem, t1, state, arrival, args, noted)
+
+        if problem.facts.only_kinks:
+            y1, slope = turned(problem, t1, state, values, arrival.due, args), jnp.zeros_like(x1)
+        else:
+            y1, slope, noted = lax.cond(any_member(fired), events, lambda state: (state, *none), state)
+            # The branch is taken if any member of a batch has an event; the others keep their states.
+            y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
+        dense_info = dict(
+            inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution, **{NOTED: noted}
+        )
+        finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
+        result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
+        result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
+        result = diffrax.RESULTS.where((y1.stuck >= 0) & (y1.ended == 0), STUCK, result)
+        result = diffrax.RESULTS.where(y1.stuck < -1, CLASH, result)
+        y1 = together(y1, appended(table, noted, y0, y1))
+        return y1, y_error, dense_info, (inner_state, fired), result
