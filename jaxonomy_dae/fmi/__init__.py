@@ -1,0 +1,1 @@
+"""Models for other tools: functions of JAX written in C."""
