@@ -233,10 +233,10 @@ class Body:
 
     def _declare(self, name: str, kind: Kind, owner: int | None) -> None:
         size = max(kind.size, 1) * np.dtype(kind.dtype).itemsize
+        self._declared.append(name)
         if kind.size <= SHORT and self.local + size <= LOCAL:
             self.local += size
             self.line(f"{c_type(kind.dtype)} {name}[{max(kind.size, 1)}];")
-            self._declared.append(name)
             return
         size = -(-size // ALIGNED) * ALIGNED
         offset = self._room(size)
@@ -317,7 +317,7 @@ class Body:
         words = collections.Counter(_words("\n".join(self.lines)))
         self.lines = [line.replace("w + @OWN@", f"w + {self.own}" if self.own else "w") for line in self.lines]
         quiet = [name for name in (*self._inputs, "w") if name not in words]
-        quiet += [name for name in self._declared if words[name] <= 2]  # assigned, but all that is read is its shape
+        quiet += [name for name in self._declared if words[name] <= 2]  # what reads them is empty
         self.lines += [f"(void){name};" for name in quiet]
 
     @property
@@ -351,6 +351,7 @@ class Body:
         elif kind.shape:  # one entry that was a scalar
             name = self.name()
             self.line(f"const {c_type(kind.dtype)} {name}[1] = {{{given.text}}};")
+            self._declared.append(name)
             self._values[result] = Value(name, kind)
         else:
             self._values[result] = Value(f"{given.text}[0]", kind)
@@ -358,6 +359,7 @@ class Body:
     def _scalar(self, result: int, kind: Kind, text: str) -> None:
         name = self.name()
         self.line(f"const {c_type(kind.dtype)} {name} = {text};")
+        self._declared.append(name)
         self._values[result] = Value(name, kind)
 
     def _is_entrywise(self, operation: Operation) -> bool:

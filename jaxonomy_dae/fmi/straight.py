@@ -18,6 +18,7 @@ CALLS = {
     "checkpoint": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
     "custom_vjp_call_jaxpr": "fun_jaxpr", "custom_vmap_call": "call",
 }  # fmt: skip
+WHOLE = {"unvmap_any": "reduce_or", "unvmap_all": "reduce_and", "unvmap_max": "reduce_max"}
 # Primitives that return what they are given.
 SAME = {"optimization_barrier", "stop_gradient", "copy", "name", "device_put", "sharding_constraint"}
 
@@ -50,13 +51,15 @@ Atom = int | Constant  # a value by its number, or a known one
 
 @dataclasses.dataclass(frozen=True)
 class Operation:
-    """One operation: its primitive's name and parameters, what it reads, and the numbers of what it computes."""
+    """One operation: its primitive's name and parameters, what it reads, the numbers of what it computes, and where it
+    comes from."""
 
     primitive: str
     params: Mapping[str, Any]
     given: tuple[Atom, ...]
     results: tuple[int, ...]
     source: Any
+    source_primitive: Any  # as JAX has it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,8 +138,10 @@ class _Reader:
                 results = self.inside(chosen.jaxpr, (*map(known, chosen.consts), *read[1:]))
                 at.update(zip(equation.outvars, results, strict=True))
                 continue
+            if name in WHOLE:  # of Equinox: without `vmap`, a reduction of all entries
+                name, params = WHOLE[name], {"axes": tuple(range(len(equation.invars[0].aval.shape)))}
             results = tuple(self.new(v.aval) for v in equation.outvars)
-            self.operations.append(Operation(name, params, read, results, equation.source_info))
+            self.operations.append(Operation(name, params, read, results, equation.source_info, equation.primitive))
             at.update(zip(equation.outvars, results, strict=True))
         return tuple(map(atom, program.outvars))
 
