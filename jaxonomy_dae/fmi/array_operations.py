@@ -228,14 +228,18 @@ def _gather(body: Writer, params: Params, given: Sequence[Value], results: Seque
             tests.append(f"{name} >= 0 && {name} <= {last}")
         for d, b in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
             begin[d] = batch[b]
-        at = [
-            f"({begin[d]} + {offset[d]})" if d in begin and d in offset else begin.get(d, offset.get(d, "0"))
-            for d in range(len(shape))
-        ]
+        at = [_place(begin.get(d), offset.get(d)) for d in range(len(shape))]
         value = source.at(flat(at, shape)) if source.kind.size else "0"
         if drops and tests:
             value = f"{' && '.join(tests)} ? {value} : {_filling(params, out.kind)}"
         body.line(f"{out.at(flat(i, out.kind.shape))} = {value};")
+
+
+def _place(begin: str | None, offset: str | None) -> str:
+    """An index inside a window that begins somewhere."""
+    if begin is None:
+        return offset or "0"
+    return begin if offset is None else f"({begin} + {offset})"
 
 
 def _mode(params: Params) -> str:
@@ -275,10 +279,7 @@ def _scatters(primitive: str | None) -> Emit:
                 tests.append(f"{name} >= 0 && {name} <= {last}")
             for d, b in zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True):
                 begin[d] = batch[b]
-            at = [
-                f"({begin[d]} + {offset[d]})" if d in begin and d in offset else begin.get(d, offset.get(d, "0"))
-                for d in range(len(shape))
-            ]
+            at = [_place(begin.get(d), offset.get(d)) for d in range(len(shape))]
             target, update = out.at(flat(at, shape)), updates.at(flat(i, updates.kind.shape))
             new = update if primitive is None else _cell(primitive, [target, update], out.kind.dtype)
             line = f"{target} = {new};"

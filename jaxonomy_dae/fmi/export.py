@@ -49,7 +49,8 @@ def export_fmu(
     **Arguments:**
 
     - `path`: the file, `"plant.fmu"`.
-    - `outputs`: the variables that are outputs, continuous or discrete. None: all of them; choose some of a large model.
+    - `outputs`: the variables that are outputs, continuous or discrete. None: all of them; choose some of a large
+        model.
     - `parameters`: the parameters, arrays of parameters and networks that an importer may set. `"all"`: each of them.
         Others keep the values of `system`. Those that only the start reads are `fixed`, others are `tunable`.
     - `platforms`: for which platforms binaries are made, as `"x86_64-windows"`; `"all"` for all that are known. Those
@@ -219,11 +220,11 @@ class _Model:
 
     # --- what depends on what ---------------------------------------------------------------------------------------
 
-    def _dependencies(self) -> sp.csr_array:
+    def _dependencies(self) -> Any:
         """For each unknown, the numbers of the layout that it depends on: shape (unknowns, layout)."""
         n, parts = self.layout.size, []
 
-        def columns(name: str, count: int) -> sp.csr_array | None:
+        def columns(name: str, count: int) -> Any:
             if not count or name == "z":
                 return None
             begin = self.layout[name]
@@ -284,6 +285,7 @@ class _Model:
             at["t"],
         )
         self.state_places, self.slope_places = [], []
+        jumps = plan.events is not None or bool(plan.n_projected)
         for k, name in enumerate(system.states):
             unit = self._unit(name)
             begins = name in p.starts
@@ -294,7 +296,7 @@ class _Model:
             )  # fmt: skip
             variable = Variable(
                 own.name, "output" if name in is_output else "local", "continuous", own, unit=unit,
-                initial="exact" if begins else "calculated", nominal=float(sizes[k]), reinit=plan.events is not None or bool(plan.n_projected),
+                initial="exact" if begins else "calculated", nominal=float(sizes[k]), reinit=jumps,
                 start=np.array(self._start(name)) if begins else None,
             )  # fmt: skip
             self.state_places.append(add(variable, place))
@@ -389,11 +391,16 @@ class _Model:
         outputs |= {place: self._places(nx + k) for k, place in enumerate(self.output_places)}
         outputs |= {place: None for place, is_output in self.discrete_places if is_output}
         outputs |= {place: self._places(nx + ny + k) for k, place in enumerate(self.guard_places)}
-        derivatives = {place: self._places(k) for k, place in enumerate(self.slope_places)}
-        indicators = {place: self._places(nx + ny + k) for k, place in enumerate(self.indicator_places)}
+        derivatives: dict[int, Sequence[int] | None] = {
+            place: self._places(k) for k, place in enumerate(self.slope_places)
+        }
+        indicators: dict[int, Sequence[int] | None] = {
+            place: self._places(nx + ny + k) for k, place in enumerate(self.indicator_places)
+        }
+        moving = {*self.state_places, *self.slope_places}
         calculated = [
             k for k, v in enumerate(self.variables)
-            if v.initial == "calculated" and (v.causality == "output" or k in self.state_places or k in self.slope_places)
+            if v.initial == "calculated" and (v.causality == "output" or k in moving)
         ]  # fmt: skip
         return Structure(outputs, derivatives, indicators, calculated)
 

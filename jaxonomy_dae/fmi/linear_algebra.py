@@ -42,7 +42,8 @@ static void jx_lu_$G($T *a, int32_t *pivots, int32_t *order, int n, int m) {
 """),
     # a x = b or its transpose for `other` right-hand sides, whose entries are `step` apart, and `skip` from each other.
     **_both("""\
-static void jx_triangular_$G(const $T *a, $T *b, int n, int other, int step, int skip, int lower, int turned, int unit) {
+static void jx_triangular_$G(
+    const $T *a, $T *b, int n, int other, int step, int skip, int lower, int turned, int unit) {
   for (int c = 0; c < other; ++c)
     for (int p = 0; p < n; ++p) {
       const int i = lower ? p : n - 1 - p;

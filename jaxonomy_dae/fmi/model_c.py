@@ -34,7 +34,7 @@ class Layout:
         places, begin = {}, 0
         for name, count in counts.items():
             places[name] = begin, count
-            begin += count
+            begin += max(count, 1)  # all begin elsewhere: functions are told that their arguments do not overlap
         return cls(places)
 
     def __getitem__(self, name: str) -> int:
@@ -43,7 +43,7 @@ class Layout:
 
     @property
     def size(self) -> int:
-        return sum(count for _, count in self.places.values())
+        return sum(max(count, 1) for _, count in self.places.values())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +122,7 @@ def model_files(
             *(_table(f"char *const {name.upper()}", [text(t) for t in texts]) for name, texts in names.items()),
         ]
     )
-    fixed = {name: files(__package__).joinpath("c", name).read_text() for name in FIXED}
+    fixed = {name: files("jaxonomy_dae.fmi").joinpath("c", name).read_text() for name in FIXED}
     return {**fixed, "model.h": header, "model.c": body}
 
 

@@ -167,7 +167,9 @@ class Programs:
         memory = q, of_guards, of_clocks, of_run
         if self.plan.events is not None:
             problem = self.problem(system, resolution)
-            state = HybridState(whole, q, of_guards, of_clocks, of_run, None)
+            state = HybridState(
+                x=whole, q=q, of_guards=of_guards, of_clocks=of_clocks, of_run=of_run, table=None
+            )  # fmt: skip
             arrival, values, armed = self._arrival(problem, t, state, args)
             state = state.but(armed=armed, size=arrival.size)
             fired = jnp.any(arrival.due)
@@ -211,8 +213,8 @@ class Programs:
         self, t: Array, x: Array, z: Array, q: Array, p: Array, u: Array, of_guards: Array, of_clocks: Array,
         of_run: Array, resolution: Array, tolerance: Array, step: Array, *weights: Array,
     ) -> tuple[Array, ...]:  # fmt: skip
-        """After a step of length `step` to t. Returns (z, the guards' memory, the run's, whether an event is due, or the
-        states are farther from their constraints than `tolerance` allows)."""
+        """After a step of length `step` to t. Returns (z, the guards' memory, the run's, whether an event is due,
+        or the states are farther from their constraints than `tolerance` allows)."""
         system, args = self.at(p, weights), self.args(u)
         held = system.holding(q) if self.nq else system
         whole = self.whole(held, t, x, z, u)
@@ -221,7 +223,9 @@ class Programs:
             wants = wants | (self._drift(held, t, whole, args, tolerance) > 1.0)
         if self.plan.events is not None:
             problem = self.problem(system, resolution)
-            state = HybridState(whole, q, of_guards, of_clocks, of_run, None)
+            state = HybridState(
+                x=whole, q=q, of_guards=of_guards, of_clocks=of_clocks, of_run=of_run, table=None
+            )  # fmt: skip
             span = jnp.maximum(step, FORGOTTEN * state.span)
             turns = jnp.where(step > MOVED * resolution, 0.0, state.turns)
             state = state.but(span=span, turns=turns)

@@ -5,8 +5,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
+from jax.core import Tracer
 
 from ..base.errors import ModelError
 
@@ -171,7 +171,7 @@ def known(value: Any) -> Constant:
 
     - `ModelError` for one that is being traced.
     """
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         raise ModelError("code is written for a function that is not inside jit, grad or vmap")
     return Constant(np.asarray(value))
 

@@ -162,8 +162,10 @@ def expression(rng, inputs, depth):
         return inputs[rng.integers(len(inputs))]
     a, b = expression(rng, inputs, depth - 1), expression(rng, inputs, depth - 1)
     return (
-        lambda x: a(x) + b(x), lambda x: a(x) * b(x), lambda x: a(x) - 0.5 * b(x), lambda x: jnp.tanh(a(x)) + b(x)[::-1],
-        lambda x: jnp.where(a(x) > b(x), a(x), b(x)), lambda x: a(x) / (1.0 + b(x) ** 2), lambda x: jnp.sin(a(x)) * b(x),
+        lambda x: a(x) + b(x), lambda x: a(x) * b(x), lambda x: a(x) - 0.5 * b(x),
+        lambda x: jnp.tanh(a(x)) + b(x)[::-1],
+        lambda x: jnp.where(a(x) > b(x), a(x), b(x)), lambda x: a(x) / (1.0 + b(x) ** 2),
+        lambda x: jnp.sin(a(x)) * b(x),
         lambda x: jnp.cumsum(a(x)) - b(x), lambda x: a(x)[jnp.array([4, 0, 0, 2, 1])] + b(x),
         lambda x: jnp.concatenate([a(x)[:2], b(x)[2:]]), lambda x: jnp.outer(a(x), b(x)) @ (a(x) / 10.0),
         lambda x: a(x).at[jnp.array([1, 1, 3])].add(b(x)[:3]), lambda x: jnp.exp(-jnp.abs(a(x))) + jnp.max(b(x)),
