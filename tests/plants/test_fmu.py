@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(compiler_for(this_platform()) is None, reason="n
 
 
 def exported(system, folder, name="model", **options):
-    path = export_fmu(system, folder / f"{name}.fmu", **options)
+    path = system.export_fmu(folder / f"{name}.fmu", **options)
     assert problems(path) == []
     return path
 
