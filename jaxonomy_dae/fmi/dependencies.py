@@ -52,7 +52,6 @@ def _of_program(program: Straight, given: Sequence[Any], constants: Sequence[Any
         kinds = [program.kinds[r] for r in operation.results]
         if all(r is None for r in read):
             results: list[Any] = [None] * len(kinds)
-            values.update(_computed(operation, [value(a) for a in operation.given], kinds))
         elif operation.primitive in CALLS:
             inner, closed = function_of(operation)
             known_values = [*closed, *(value(a) for a in operation.given)]
@@ -65,17 +64,6 @@ def _of_program(program: Straight, given: Sequence[Any], constants: Sequence[Any
             results = _of_operation(program, operation, read, value, n)
         found.update(zip(operation.results, results, strict=True))
     return [_whole(of(a), program.kind(a).size, n) for a in program.results]
-
-
-def _computed(operation: Operation, given: Sequence[np.ndarray | None], kinds: Sequence[Any]) -> dict[int, np.ndarray]:
-    """The results of an operation on known integers, such as the places that a gather reads."""
-    if any(v is None for v in given) or any(np.dtype(kind.dtype).kind not in "iub" for kind in kinds):
-        return {}
-    if operation.primitive not in (*ELEMENTWISE, *MOVES, "iota"):
-        return {}
-    found = operation.source_primitive.bind(*map(jnp.asarray, given), **operation.params)
-    results = found if operation.source_primitive.multiple_results else [found]
-    return {number: np.asarray(v) for number, v in zip(operation.results, results, strict=True)}
 
 
 def _closed(program: Any, read: Sequence[Rows | None], values: Sequence[np.ndarray | None], n: int) -> list[Rows]:
