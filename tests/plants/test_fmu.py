@@ -110,6 +110,9 @@ def test_a_ball_bounces_as_in_closed_form(ball):
     expected = np.array([bounces(1.0, 0.8, 9.81, t) for t in found["time"]])
     for k, name in enumerate(["b.h", "b.v", "b.n"]):
         np.testing.assert_allclose(found[name], expected[:, k], atol=1e-7)
+    found = run(ball, 2.0, ["b.h", "b.n"], fmi_type="CoSimulation")
+    np.testing.assert_allclose(found["b.h"], expected[:, 0], atol=1e-12)
+    np.testing.assert_array_equal(found["b.n"], expected[:, 2])
     found = run(ball, 1.0, ["b.h"], start_values={"b.h0": 2.0, "b.e": 0.5})
     np.testing.assert_allclose(found["b.h"][-1], bounces(2.0, 0.5, 9.81, 1.0)[0], atol=1e-7)
 
@@ -200,6 +203,8 @@ def test_what_cannot_be_exported_is_refused_by_name(tmp_path, ball):
         export_fmu(system, tmp_path / "x.fmu", parameters=["b.n"])
     with pytest.raises(ModelError, match="platforms: 'amiga' is not known"):
         export_fmu(system, tmp_path / "x.fmu", platforms="amiga")
+    with pytest.raises(ModelError, match="kinds: 'simulink' is not known"):
+        export_fmu(system, tmp_path / "x.fmu", kinds=["simulink"])
 
     def gamma(u):
         return jax.scipy.special.gammainc(2.0, u)
@@ -310,6 +315,7 @@ def test_a_pendulum_with_a_network(tmp_path, mode):
     check_derivatives(system, path, ["pend.lam"])
     t1 = 2.0 if mode == "auto" else 0.5
     compare(system, path, t1, ["pend.x", "pend.vy", "pend.lam"], 1e-6)
+    compare(system, path, t1, ["pend.x", "pend.vy", "pend.lam"], 1e-6, fmi_type="CoSimulation")
 
 
 @pytest.mark.slow
@@ -345,6 +351,7 @@ def test_runs_are_those_of_simulate(tmp_path, kind, names, t1):
     system = hybrid(kind, "c")
     path = exported(system, tmp_path)
     compare(system, path, t1, names, 1e-6)
+    compare(system, path, t1, names, 1e-6, fmi_type="CoSimulation")
     check_derivatives(system, path, [n for n in names if n not in system.discretes and n not in system.states])
 
 
@@ -358,6 +365,7 @@ def test_instances_in_threads_do_not_see_each_other(ball):
             fmu.model.enterContinuousTimeMode()
             fmu.model.setTime(0.01 * (j + 1))
             fmu.model.setContinuousStates(np.array([-1e-12, -1.0 - k]).ctypes.data_as(model_pointer()), 2)
+            fmu.model.completedIntegratorStep()
             fmu.model.enterEventMode()
             fmu.update()
             speeds.append(fmu.get("b.v")[0])
