@@ -173,7 +173,7 @@ FAULTS = [
         "host/kept.py",
         '"processor": _machine(),',
         '"processor": "",',
-        "tests/kernels/test_tiers.py",
+        "tests/kernels/test_kept_programs.py",
     ),
     Fault(
         "compile/model/group.py",
