@@ -155,6 +155,8 @@ def test_the_gallery_has_an_overview():
         assert re.search(rf"### \[[^\]]+\]\([./]*{entry.stem}\.ipynb\)\n\n[^\n]+\.", text), entry.stem
         suffix, figure = gallery.last_figure_of(entry.path)
         assert f"({entry.stem}.{suffix})" in text and "TIME" not in text
+        file = gallery.colab_button(entry).partition("/blob/main/")[2].partition(")")[0]
+        assert (gallery.EXAMPLES.parent / file) == entry.path and gallery.colab_button(entry) in text
         assert b"<svg" in figure if suffix == "svg" else figure.startswith(b"\x89PNG")
     found = {path.stem for path in (gallery.EXAMPLES / "gallery").glob("*.ipynb")} | {"neural_dae_pendulum_drag"}
     assert found == {entry.stem for entry in gallery.entries()}
