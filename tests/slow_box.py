@@ -2,7 +2,7 @@
 
 Given are the slow tests, how long each took (`durations.json`) and when each passed last on this machine. The tests
 that nobody has timed come first, then those that did not pass for the longest time. Among equals, as in a fresh clone
-on a fresh machine, they stand on a circle on which each landing begins elsewhere, so that nothing needs to be committed.
+on a fresh machine, they stand on a circle on which each landing begins elsewhere, and nothing needs to be committed.
 When the time is spent, no further test begins. Those that run end, so that nothing is cut.
 """
 

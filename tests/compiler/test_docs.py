@@ -20,7 +20,8 @@ def public_names() -> list[str]:
     found = []
     for name in ("", *MODULES):
         module = importlib.import_module(f"jaxonomy_dae.{name}".rstrip("."))
-        text = pathlib.Path(module.__file__ or "").read_text()
+        file = pathlib.Path(module.__file__ or "")
+        text = (file if name else file.with_name("names.py")).read_text()
         own = re.findall(r"^from .* as (\w+)$", text, re.M) or re.findall(r"^def ([a-z]\w*)", text, re.M)
         found += [f"{module.__name__}.{n}" for n in own]
     return found
