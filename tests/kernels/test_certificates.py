@@ -84,6 +84,7 @@ def test_laws_keep_their_promise_whatever_their_weights(name):
     assert found.holds and "20 sets" in found.checked
 
 
+@pytest.mark.slow
 def test_callables_are_sampled_and_climbed():
     assert_passive(lambda v: -v * jnp.sum(v**2), 3)
     assert_passive(lambda u: -u[:1] * jnp.exp(-u[1]), 1, inputs=[1.0, 0.2])

@@ -198,7 +198,7 @@ if WAITS:
 """
 
 
-@pytest.mark.long("two processes that import JAX")
+@pytest.mark.slow
 @pytest.mark.parametrize("waits", [False, True])
 def test_the_interpreter_leaves_cleanly(waits):
     """A script that ends after its second call has nothing to wait for; one that ends while XLA optimizes waits for it,
@@ -281,6 +281,7 @@ def test_cotangents_that_are_zero_are_left_out():
     assert jax.grad(lambda x: programs.call(both, True, (x,), {})[1])(jnp.array(4.0)) == 0.25
 
 
+@pytest.mark.slow
 def test_rows_of_a_loop_that_are_not_read():
     """JAX takes the zero cotangent of rows that a loop collects for that of one row."""
 
