@@ -20,7 +20,7 @@ ORDER = [
     "run/system", "run/start", "run/simulation",
     "learning", "analysis", "plotting", "testing", "library", "modelica",
 ]  # fmt: skip
-FACES = {"__init__", "errors", "linear", "solvers"}  # public names of the rooms below, under short paths
+FACES = {"__init__", "names", "errors", "linear", "solvers"}  # public names of the rooms below, under short paths
 # Methods that hand over to a room above their own, when they are called.
 DEFERRED = {("run/system", "run/start"), ("run/simulation", "plotting"), ("analysis", "plotting")}
 # Imports inside a function, or for types alone, that close a circle of modules; and why they are there. Patterns stand

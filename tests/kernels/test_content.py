@@ -258,7 +258,7 @@ for system in (decay(), decay(law)):
 """
 
 
-@pytest.mark.long("two processes that compile a gradient")
+@pytest.mark.slow
 def test_the_next_process_traces_nothing_but_code_that_is_new(tmp_path, monkeypatch):
     """The second process finds the model's programs. A user's function of the same name is another one there."""
     monkeypatch.setenv("JAXONOMY_DAE_CACHE", str(tmp_path))

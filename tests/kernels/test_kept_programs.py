@@ -316,6 +316,7 @@ def test_cotangents_that_are_zero_are_left_out():
     assert jax.grad(lambda x: programs.call(both, False, (x,), {})[1])(jnp.array(4.0)) == 0.25
 
 
+@pytest.mark.slow
 def test_rows_of_a_loop_that_are_not_read():
     """JAX takes the zero cotangent of rows that a loop collects for that of one row."""
 

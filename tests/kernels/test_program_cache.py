@@ -64,6 +64,7 @@ def name(function):
     return f"{function.__module__}.{function.__qualname__}"
 
 
+@pytest.mark.slow
 def test_the_least_recently_used_program_goes(limited):
     """Half of eight may be used: before the sixth, the oldest goes, which is not the one that was called since."""
     programs, _ = limited
@@ -85,6 +86,7 @@ def test_the_least_recently_used_program_goes(limited):
     assert call(programs, x, 1, function=times) == 3.0  # compiled anew
 
 
+@pytest.mark.slow
 def test_programs_in_use_do_not_push_each_other_out(limited):
     """Where others hold half of what is allowed already, what is called in turn stays compiled."""
     programs, others = limited
@@ -122,6 +124,7 @@ def test_values_of_other_shapes_and_types_are_other_programs():
     assert len(programs) == 3
 
 
+@pytest.mark.slow
 @on_linux
 def test_what_is_let_go_returns_its_mappings():
     """Values, gradients and batches of gradients: all that was compiled of a function."""
