@@ -337,7 +337,7 @@ def _torn_step(
     entries: dict[tuple[int, int], np.ndarray] = {}
     numbers = set()
     for e, (g, slots) in enumerate(shape):
-        template, inside = extended.groups[g].template, _inside(slots)
+        inside = _inside(slots)
         rows = row_of[[block.equations[e] for block in alike]]
         for k in inside:
             at = (e, slots[k])
