@@ -57,6 +57,16 @@ def folder() -> Path | None:
     return _user_cache() / "jaxonomy_dae" / "programs"
 
 
+def folder_of(kind: str) -> Path | None:
+    """The folder that keeps data of a kind for the next process, beside that of programs; None if nothing is kept."""
+    if _CHOSEN:
+        return None if _CHOSEN[0] is None else _CHOSEN[0] / kind
+    named = os.environ.get(VARIABLE)
+    if named is not None:
+        return Path(named).expanduser() / kind if named else None
+    return _user_cache() / "jaxonomy_dae" / kind
+
+
 def _user_cache() -> Path:
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
