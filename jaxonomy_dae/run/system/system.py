@@ -548,6 +548,26 @@ class AcausalSystem(eqx.Module):
             raise ModelError("initialization_report needs numbers: call it outside jit, grad and vmap")
         return InitializationReport(self, found, t0, inputs, initial, names)
 
+    def export_fmu(
+        self,
+        path: Any,
+        *,
+        outputs: Sequence[str] | None = None,
+        parameters: Sequence[str] | str = "all",
+        platforms: Sequence[str] | str | None = None,
+        stop_time: float = 1.0,
+        tolerance: float = 1e-6,
+        overwrite: bool = False,
+    ) -> Any:
+        """Writes this system as a Functional Mock-up Unit, which other tools run without Python: see
+        `jaxonomy_dae.fmi.export_fmu`, which has the same arguments."""
+        from ...fmi.export import export_fmu
+
+        return export_fmu(
+            self, path, outputs=outputs, parameters=parameters, platforms=platforms, stop_time=stop_time,
+            tolerance=tolerance, overwrite=overwrite,
+        )  # fmt: skip
+
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
         if isinstance(solve_for, str):
             raise ModelError(f"solve_for is a list of parameters' names; write solve_for=[{solve_for!r}]")
