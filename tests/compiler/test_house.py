@@ -22,7 +22,9 @@ ORDER = [
 ]  # fmt: skip
 FACES = {"__init__", "names", "errors", "linear", "solvers"}  # public names of the rooms below, under short paths
 # Methods that hand over to a room above their own, when they are called.
-DEFERRED = {("run/system", "run/start"), ("run/simulation", "plotting"), ("analysis", "plotting"), ("run/system", "fmi")}
+DEFERRED = {
+    ("run/system", "run/start"), ("run/simulation", "plotting"), ("analysis", "plotting"), ("run/system", "fmi"),
+}  # fmt: skip
 # Imports inside a function, or for types alone, that close a circle of modules; and why they are there. Patterns stand
 # for several modules.
 CLOSING = {
