@@ -96,9 +96,10 @@ def open_program(program: Any) -> tuple[Any, Sequence[Any]]:
     return (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, ())
 
 
-def straight(program: Any) -> Straight:
-    """The operations of a program (`jax.core.Jaxpr`); its closed-over values are its first arguments."""
-    return _Reader().read(program)
+def straight(program: Any, values: Sequence[np.ndarray | None] = ()) -> Straight:
+    """The operations of a program (`jax.core.Jaxpr`); its closed-over values are its first arguments. `values` has the
+    first arguments, as far as they are known."""
+    return _Reader().read(program, values)
 
 
 class _Reader:
@@ -113,8 +114,10 @@ class _Reader:
         self.kinds.append(Kind.of(aval))
         return len(self.kinds) - 1
 
-    def read(self, program: Any) -> Straight:
+    def read(self, program: Any, values: Sequence[np.ndarray | None]) -> Straight:
         arguments = tuple(self.new(v.aval) for v in (*program.constvars, *program.invars))
+        known_ones = zip(arguments, values, strict=False)
+        self.integers.update({a: v for a, v in known_ones if v is not None and v.dtype.kind in "iub"})
         results = self.inside(program, arguments)
         return Straight(arguments, _needed(self.operations, results), results, self.kinds)
 

@@ -20,14 +20,11 @@ ORDER = [
     "run/system", "run/start", "run/simulation",
     "learning", "analysis", "plotting", "testing", "library", "modelica", "fmi",
 ]  # fmt: skip
-FACES = {"__init__", "errors", "linear", "solvers"}  # public names of the rooms below, under short paths
+FACES = {"__init__", "names", "errors", "linear", "solvers"}  # public names of the rooms below, under short paths
 # Methods that hand over to a room above their own, when they are called.
 DEFERRED = {
-    ("run/system", "run/start"),
-    ("run/simulation", "plotting"),
-    ("analysis", "plotting"),
-    ("run/system", "fmi"),
-}
+    ("run/system", "run/start"), ("run/simulation", "plotting"), ("analysis", "plotting"), ("run/system", "fmi"),
+}  # fmt: skip
 # Imports inside a function, or for types alone, that close a circle of modules; and why they are there. Patterns stand
 # for several modules.
 CLOSING = {

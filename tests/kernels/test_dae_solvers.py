@@ -67,7 +67,7 @@ def test_projection_keeps_hidden_constraints(solver):
 # --- published values ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.long("BDF against published values: one program")
+@pytest.mark.slow
 @ALSO_RODAS5P
 def test_robertson_over_eleven_decades(solver):
     problem = PROBLEMS["robertson"]
@@ -213,7 +213,7 @@ class Program:
 program = functools.cache(Program)
 
 
-@pytest.mark.long("compiles the program that the tests beside it share")
+@pytest.mark.slow
 @ALSO_BDF
 def test_jumps_that_are_named_cost_less(solver):
     ts = np.linspace(0.0, 1.0, 101)

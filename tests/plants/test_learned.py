@@ -166,6 +166,7 @@ def implicit_law(i):
     return jnp.log1p(i / 0.4)
 
 
+@pytest.mark.slow
 def test_a_resistor_with_a_learned_law():
     solution, v = together(), diode_discharge(T)
     np.testing.assert_allclose(solution["store.v"], v, **CLOSE)
