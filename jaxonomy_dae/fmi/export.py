@@ -1,6 +1,5 @@
 """A compiled system as an FMU: a zip file with a description, C sources, and a binary."""
 
-import dataclasses
 import hashlib
 import io
 import math
@@ -127,7 +126,7 @@ def fmu_files(
 ) -> tuple[dict[str, str], str, str]:  # fmt: skip
     """The C files by name, `modelDescription.xml`, and the identifier of the model."""
     check_exportable(system)
-    system = dataclasses.replace(system.merged(), stiffness=None)
+    system = system.merged().without_stiffness
     model = _Model(system, outputs, parameters)
     identifier = re.sub(r"\W", "_", stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"m_{identifier}"
