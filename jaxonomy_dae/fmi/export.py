@@ -1,6 +1,5 @@
 """A compiled system as an FMU: a zip file with a description, C sources, and a binary."""
 
-import dataclasses
 import hashlib
 import io
 import math
@@ -134,7 +133,7 @@ def fmu_files(
 ) -> tuple[dict[str, str], str, str]:  # fmt: skip
     """The C files by name, `modelDescription.xml`, and the identifier of the model."""
     check_exportable(system)
-    system = dataclasses.replace(system.merged(), stiffness=None)
+    system = system.merged().without_stiffness
     if kinds is not None and (unknown := set(kinds) - set(KINDS)):
         raise ModelError(f"kinds: '{min(unknown)}' is not known; there are {', '.join(KINDS)}")
     small = len(system.states) <= CO_SIMULATION_UPTO

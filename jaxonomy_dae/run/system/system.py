@@ -121,6 +121,11 @@ class AcausalSystem(eqx.Module):
         folded = "".join(f"<details><summary>{title}</summary>{''.join(body)}</details>" for title, body in sections)
         return f"<p><code>{html.escape(repr(self))}</code></p>{folded}"
 
+    @property
+    def without_stiffness(self) -> "AcausalSystem":
+        """The same for programs that choose no solver, which models share though one is stiffer than the other."""
+        return dataclasses.replace(self, stiffness=None)
+
     # --- changing ----------------------------------------------------------------------------------------------
 
     def with_parameters(self, values: Mapping[str, Any]) -> "AcausalSystem":
