@@ -178,7 +178,7 @@ FAULTS = [
         "host/kept.py",
         '"processor": _machine(),',
         '"processor": "",',
-        "tests/kernels/test_tiers.py",
+        "tests/kernels/test_kept_programs.py",
     ),
     Fault(
         "learning/noise.py",

@@ -133,8 +133,9 @@ class SystemPlan:
         """A digest of the structure, the same in every process; functions in it are told apart by names alone."""
         return self._identity.digest
 
-    def told(self) -> tuple[str, tuple[Callable, ...]]:
-        """What is the same in every process: see `programs.lasting`."""
+    def identified(self) -> tuple[str, tuple[Callable, ...]]:
+        """For `host/content.py`: the digest, which leaves out what functions in the plan compute, and these
+        functions."""
         return self._identity.digest, self._identity.functions
 
     @property
