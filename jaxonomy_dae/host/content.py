@@ -15,6 +15,7 @@ import dis
 import enum
 import functools
 import hashlib
+import sys
 import types
 import weakref
 from collections.abc import Sequence
@@ -39,16 +40,16 @@ _BESIDE = frozenset({
 })  # fmt: skip
 
 
-class Identified(Protocol):
+class HasContent(Protocol):
     """A part that says itself what it is, instead of being walked over."""
 
-    def identified(self) -> tuple[str, Sequence[Any]]:
+    def __content__(self) -> tuple[str, Sequence[Any]]:
         """A digest that equal parts share in all processes; and further parts, which the digest leaves out."""
         ...
 
 
 class Hidden(NamedTuple):
-    """Stands for what an identified part cannot see of itself."""
+    """Stands for what a part that says itself what it is cannot see of itself."""
 
     what: str
 
@@ -103,7 +104,8 @@ class _Walk:
             return self.hidden("a traced value")
         if isinstance(part, jax.Array):
             return self.say("array", _of_array(part))
-        if isinstance(part, np.ndarray | np.generic) and part.dtype != object:
+        # Others that are arrays, too, such as masked ones, have more than numbers: `_object`.
+        if (kind is np.ndarray or isinstance(part, np.generic)) and not part.dtype.hasobject:
             array = np.ascontiguousarray(part)
             return self.say("numbers", kind.__name__, str(array.dtype), str(array.shape), array.tobytes())
         if isinstance(part, np.dtype):
@@ -122,10 +124,10 @@ class _Walk:
             self.part(part)
 
     def _one(self, part: Any, kind: type) -> None:
-        if hasattr(kind, "identified"):
-            digest, more = part.identified()
+        if hasattr(kind, "__content__"):
+            digest, more = part.__content__()
             self._name_of_class(kind)
-            self.say("identified", digest)
+            self.say("own content", digest)
             return self.parts(more)
         match part:
             case PyTreeDef():
@@ -151,6 +153,9 @@ class _Walk:
                 return self._set(part, kind)
             case list() | dict() | tuple() | types.MappingProxyType():
                 return self._container(part, kind)
+            case np.ndarray() if kind is np.ndarray:  # of objects
+                self.say("array of objects", str(part.dtype), str(part.shape))
+                return self.parts(part.ravel().tolist())
         if isinstance(part, types.BuiltinFunctionType) and not isinstance(part.__self__, types.ModuleType | None):
             self.say("method", part.__name__)  # of a list, say
             return self.part(part.__self__)
@@ -254,7 +259,7 @@ class _Walk:
                 self.say("missing", name)
         for name in code.imports:
             self.say("import", name)
-            module = libraries.sys.modules.get(name)
+            module = sys.modules.get(name)
             if module is None:
                 self.hidden(f"the import of {name}")
             else:
@@ -373,7 +378,7 @@ def _is_settled(part: Any, numbers: bool) -> bool:
         part, "__dict__", None
     ):  # what stands for a missing field
         return True
-    return hasattr(kind, "identified") and kind.__module__.startswith(_OWN) and not part.identified()[1]
+    return hasattr(kind, "__content__") and kind.__module__.startswith(_OWN) and not part.__content__()[1]
 
 
 def _name(part: Any) -> str:

@@ -229,6 +229,7 @@ def test_jumps_that_are_named_cost_less(solver):
     assert np.abs(np.asarray(x)[:, 0] - exact).max() > 1e-4 or untold > told + 5 or not okay
 
 
+@pytest.mark.slow
 @ALSO_BDF
 def test_there_and_back(solver):
     (x, z), _, _ = program(solver)(CIRCLE, np.linspace(0.0, 6.0, 101), 1e-8)

@@ -482,7 +482,7 @@ FILES = {
 }
 
 
-@pytest.mark.long("three processes that import JAX")
+@pytest.mark.slow
 def test_two_processes(tmp_path):
     """The second process finds the programs of laws that are the same, and those alone."""
     environment = {key: v for key, v in os.environ.items() if not key.startswith("JAX_COMPILATION")}

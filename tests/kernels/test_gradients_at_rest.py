@@ -97,6 +97,7 @@ def test_in_batches():
             assert abs(by["x0"] - np.cos(OMEGA)) < RESOLVED
 
 
+@pytest.mark.slow
 def test_beside_what_moves():
     """The steps of what moves evenly grow without limit, too."""
     assert abs(found()["beside motion"][1]["x0"] - np.cos(OMEGA)) < RESOLVED

@@ -84,6 +84,7 @@ def test_where_a_condition_is_at_the_start(k):
         np.testing.assert_allclose(integral[k], 2 * during, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_events_at_once_are_listed():
     """Upwards from 0, x > 0 becomes true for two events, one of which happens at the start; from −1, all four do."""
     cases, *_, counts = on_a_ramp()

@@ -72,7 +72,7 @@ def sine():
 
 
 SAID = {Sine: "sin(x)", Slider: "x**2 + y**2", Turning: "z**2"}
-QUICK = {(Slider, "prescribed"), (Turning, "default")}
+QUICK = {(Turning, "default")}
 
 
 @pytest.mark.parametrize(

@@ -112,11 +112,12 @@ class Solution(eqx.Module):
         t, x, none = cut(self.ts, (..., k)), cut(self.states, row), cut(self.states, (..., k, slice(0)))
         if not isinstance(x, Tracer) and x.ndim == 1 and not np.isfinite(x).all():
             raise ModelError(f"solution.at({int(k)}): the run did not get to t={float(t):g} ({self.result})")
+        of = self.system.plan.digest_of_states
         if self.discrete is None or self.memory is None:
-            return SavedState(t, x, none, none, none, none)
+            return SavedState(t, x, none, none, none, none, of)
         memory = self.memory
         sides, ticked = cut(memory.sides, row), cut(memory.ticked, row)
-        return SavedState(t, x, cut(self.discrete, row), sides, ticked, memory.sizes)
+        return SavedState(t, x, cut(self.discrete, row), sides, ticked, memory.sizes, of)
 
     def __getitem__(self, name: Any) -> Any:
         """The values of a variable, or of several: `solution["pend.x"]` has shape `(n,)`, and

@@ -37,7 +37,7 @@ class ParameterNames:
     arrays: ArrayNames = dataclasses.field(default_factory=ArrayNames, compare=False, hash=False)
     digest: str = ""
 
-    def identified(self) -> tuple[str, tuple]:
+    def __content__(self) -> tuple[str, tuple]:
         """For `host/content.py`."""
         return self.digest, ()
 
