@@ -132,7 +132,7 @@ class ProgramCache:
     def __len__(self) -> int:
         return len(self._programs)
 
-    def identified(self) -> tuple[str, tuple]:
+    def __content__(self) -> tuple[str, tuple]:
         """For `content.py`: which programs there are decides nothing of what they compute."""
         return "programs", ()
 

@@ -15,6 +15,7 @@ import dis
 import enum
 import functools
 import hashlib
+import sys
 import types
 import weakref
 from collections.abc import Sequence
@@ -39,16 +40,16 @@ _BESIDE = frozenset({
 })  # fmt: skip
 
 
-class Identified(Protocol):
+class HasContent(Protocol):
     """A part that says itself what it is, instead of being walked over."""
 
-    def identified(self) -> tuple[str, Sequence[Any]]:
+    def __content__(self) -> tuple[str, Sequence[Any]]:
         """A digest that equal parts share in all processes; and further parts, which the digest leaves out."""
         ...
 
 
 class Hidden(NamedTuple):
-    """Stands for what an identified part cannot see of itself."""
+    """Stands for what a part that says itself what it is cannot see of itself."""
 
     what: str
 
@@ -103,7 +104,8 @@ class _Walk:
             return self.hidden("a traced value")
         if isinstance(part, jax.Array):
             return self.say("array", _of_array(part))
-        if isinstance(part, np.ndarray | np.generic) and part.dtype != object:
+        # Others that are arrays, too, such as masked ones, have more than numbers: `_object`.
+        if (kind is np.ndarray or isinstance(part, np.generic)) and not part.dtype.hasobject:
             array = np.ascontiguousarray(part)
             return self.say("numbers", kind.__name__, str(array.dtype), str(array.shape), array.tobytes())
         if isinstance(part, np.dtype):
@@ -122,10 +124,10 @@ class _Walk:
             self.part(part)
 
     def _one(self, part: Any, kind: type) -> None:
-        if hasattr(kind, "identified"):
-            digest, more = part.identified()
+        if hasattr(kind, "__content__"):
+            digest, more = part.__content__()
             self._name_of_class(kind)
-            self.say("identified", digest)
+            self.say("own content", digest)
             return self.parts(more)
         match part:
             case PyTreeDef():
@@ -151,6 +153,9 @@ class _Walk:
                 return self._set(part, kind)
             case list() | dict() | tuple() | types.MappingProxyType():
                 return self._container(part, kind)
+            case np.ndarray() if kind is np.ndarray:  # of objects
+                self.say("array of objects", str(part.dtype), str(part.shape))
+                return self.parts(part.ravel().tolist())
         if isinstance(part, types.BuiltinFunctionType) and not isinstance(part.__self__, types.ModuleType | None):
             self.say("method", part.__name__)  # of a list, say
             return self.part(part.__self__)
@@ -183,14 +188,39 @@ class _Walk:
         self.say("set", kind.__name__, *sorted(members))
 
     def _tree(self, tree: Any) -> None:
+        """The structure of a pytree. Of one that consists of the package's records and of containers, and in which no
+        function stands, equal ones have one content, which is remembered: the walk takes 0.7 ms for a pendulum."""
+        known = _TREES.get(tree)
+        if known is not None:
+            return self.say("structure", known)
+        inside = _Walk()
+        is_settled = inside._node(tree)
+        self.unseen += inside.unseen
+        digest = inside.hash.digest()
+        if is_settled and not inside.unseen:
+            if len(_TREES) >= MOST_TREES:
+                _TREES.clear()
+            _TREES[tree] = digest
+        self.say("structure", digest)
+
+    def _node(self, tree: Any) -> bool:
+        """True if equal structures have one content: in classes of others, 1 and True may mean two things."""
         inside = tree.node_data()
         if inside is None:
-            return self.say("leaf" if tree.num_leaves else "none")
+            self.say("leaf" if tree.num_leaves else "none")
+            return True
+        kind, beside = inside
         self.say("tree", str(len(tree.children())))
-        self._name_of_class(inside[0])
-        self.part(inside[1])
+        self._name_of_class(kind)
+        self.part(beside)
+        known = kind in _BUILT_IN or owner(kind.__module__) is Owner.KNOWN
+        numbers = kind in _BUILT_IN or kind.__module__.startswith(_OWN)
+        settled = known and all(
+            _is_settled(one, numbers) for one in (beside if type(beside) in (tuple, list) else [beside])
+        )
         for child in tree.children():
-            self._tree(child)
+            settled = self._node(child) and settled
+        return settled
 
     # --- code ---------------------------------------------------------------------------------------------------------
 
@@ -229,7 +259,7 @@ class _Walk:
                 self.say("missing", name)
         for name in code.imports:
             self.say("import", name)
-            module = libraries.sys.modules.get(name)
+            module = sys.modules.get(name)
             if module is None:
                 self.hidden(f"the import of {name}")
             else:
@@ -329,6 +359,26 @@ class _Walk:
 
 
 _BUILT_IN = frozenset({type(None), tuple, list, dict, set, frozenset, bool, int, float, complex, str, bytes})
+
+
+_TREES: dict[Any, bytes] = {}
+MOST_TREES = 256  # structures whose digests are remembered
+_OWN = f"{libraries.PACKAGE}."
+
+
+def _is_settled(part: Any, numbers: bool) -> bool:
+    """True for a static part that cannot change, reads nothing that can, and has one content with all that equals it;
+    numbers do so in the package's own records, whose fields have one type."""
+    kind = type(part)
+    if kind in (tuple, frozenset):
+        return all(_is_settled(one, numbers) for one in part)
+    if kind in _PLAIN:
+        return numbers or kind in (str, bytes, type(None))
+    if kind.__module__.startswith("equinox.") and not getattr(
+        part, "__dict__", None
+    ):  # what stands for a missing field
+        return True
+    return hasattr(kind, "__content__") and kind.__module__.startswith(_OWN) and not part.__content__()[1]
 
 
 def _name(part: Any) -> str:

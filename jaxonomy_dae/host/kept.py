@@ -67,6 +67,17 @@ def folder() -> Path | None:
     return None if caches is None else caches / "jaxonomy_dae" / "programs"
 
 
+def folder_of(kind: str) -> Path | None:
+    """The folder that keeps data of a kind for the next process, beside that of programs; None if nothing is kept."""
+    if _CHOSEN:
+        return None if _CHOSEN[0] is None else _CHOSEN[0] / kind
+    named = os.environ.get(VARIABLE)
+    if named is not None:
+        return Path(named).expanduser() / kind if named else None
+    caches = _user_cache()
+    return None if caches is None else caches / "jaxonomy_dae" / kind
+
+
 def _user_cache() -> Path | None:
     """The user's directory of caches; None for a user without a home, as in containers."""
     try:

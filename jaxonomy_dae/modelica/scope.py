@@ -8,7 +8,7 @@ event are discrete variables; the others are expressions, put in wherever they a
 import contextlib
 import functools
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import TypeVar
 
 import sympy
@@ -36,6 +36,8 @@ class Scope:
     """The names of a flat model that is being written into a component.
 
     - `numbers`: parameters whose values are numbers.
+    - `given`: values of parameters in place of those of the text: numbers, or expressions in parameters.
+    - `signals`: Boolean and Integer inputs that are real inputs of the component: true above 1/2, or rounded.
     - `interpreter`: evaluates expressions in these names.
     - `definitions`: which statement determines which variable.
     - `kept`: relations whose truth is kept between events.
@@ -48,8 +50,12 @@ class Scope:
       condition is false.
     """
 
-    def __init__(self, flat: FlatModel, component: Component, numbers: Collection[str] = ()):
+    def __init__(
+        self, flat: FlatModel, component: Component, numbers: Collection[str] = (),
+        given: Mapping[str, Value] | None = None, signals: Collection[str] = (),
+    ):  # fmt: skip
         self.flat, self.component, self.numbers = flat, component, numbers
+        self.given, self.signals = given or {}, signals
         self.kept = KeptRelations(component)
         self.declared = {d.name: d for d in flat.model.declarations}
         self.known: dict[str, Value] = {"time": component.ev.t}
@@ -159,6 +165,8 @@ class Scope:
 
     def _constant(self, d: Declaration) -> Value:
         """The value of a parameter: a symbol for a Real, which is then a parameter of the component."""
+        if d.name in self.given:
+            return self._as_parameter(d, self.given[d.name])
         if d.value is None or self._is_unknown(d):
             found = self._initial_algorithm(d.name)
             if isinstance(found, int | float | bool):
@@ -197,7 +205,7 @@ class Scope:
                 return value
         elif not isinstance(value, sympy.Expr):
             return value
-        elif any(not isinstance(s, ParameterSymbol) or isinstance(s, DiscreteSymbol) for s in value.free_symbols):
+        elif not _is_of_parameters(value):
             return value
         return self.component.parameter(d.name, value, unit=self._unit(d))
 
@@ -208,6 +216,9 @@ class Scope:
     def _expression_of(self, d: Declaration) -> Value:
         """What a Boolean or Integer variable is, in terms of what it depends on."""
         found = self.definitions.of.get(d.name)
+        if d.name in self.signals:
+            signal = self.component.input(d.name)
+            return sympy.Gt(signal, 0.5) if self.kind(d.type) == "Boolean" else sympy.floor(signal + 0.5)
         if found is None:  # an input of the model that nothing drives
             start = self._start(d.modifiers.get("start")) or self._least(d.type)
             return bool(start) if self.kind(d.type) == "Boolean" else int(start)
@@ -246,7 +257,7 @@ class Scope:
         """A parameter that initial equations determine: a variable that does not change. If one of them just says
         what it is, it is a parameter."""
         value = self._said_initially(d.name)
-        if isinstance(value, int | float):
+        if isinstance(value, int | float) or isinstance(value, sympy.Expr) and _is_of_parameters(value):
             return self._as_parameter(d, value)
         start = d.modifiers.get("start") if d.value is None else d.value
         symbol = self.component.variable(d.name, start=self._start(start), unit=self._unit(d))
@@ -324,7 +335,7 @@ class Scope:
         if any(isinstance(s, known_before) for s in symbols):  # a variable would have the value of another side
             return e
         name = f":value[{len(self.names)}]"
-        if all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols):
+        if _is_of_parameters(e):
             self.names[e] = self.component.parameter(name, e)
         else:
             self.names[e] = self.component.variable(name)
@@ -366,6 +377,10 @@ class Scope:
 
     def _sample(self, start: Expression, interval: Expression) -> Value:
         return self.component.sampled(self.evaluate(interval), self.evaluate(start))
+
+
+def _is_of_parameters(value: sympy.Expr) -> bool:
+    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in value.free_symbols)
 
 
 T = TypeVar("T")

@@ -28,7 +28,7 @@ from jaxonomy_dae.host.program import types_of
 class Noted(list):
     """A list that does not count as content, so that a function may read and write it behind the back of the walk."""
 
-    def identified(self):
+    def __content__(self):
         return "noted", ()
 
 
@@ -196,6 +196,8 @@ DIFFERENT = {
     "record and function": (Slow(1.0), jnp.sin),
     "classes of one name": (local(1.0), local(1.0, 2)),
     "static fields": (Slow(1.0), Slow(True)),
+    "masks": (np.ma.array([1.0, 2.0], mask=[0, 1]), np.ma.array([1.0, 2.0], mask=[1, 0])),
+    "arrays of objects": (np.array([1, None]), np.array([1.0, None])),
     "signs of zero in an array": (np.zeros(1), -np.zeros(1)),
     "keys": (jax.random.key(0), jax.random.key(1)),
 }  # fmt: skip

@@ -56,7 +56,7 @@ def times(x, k):
 class Noted(list):
     """A list that does not count as content, so that a function may note in it what it was traced for."""
 
-    def identified(self):
+    def __content__(self):
         return "noted", ()
 
 

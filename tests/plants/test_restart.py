@@ -189,6 +189,13 @@ def test_an_input_that_is_another_one_after_the_restart():
     assert len(again.events) == 1 and float(again.events.ts[0]) == 1.0
 
 
+def built_of(name):
+    def write(c, ev):
+        c.add_equations(Eq(der(c.variable(name, start=1.0, fixed=True)), 0))
+
+    return compiled(component(write))
+
+
 def test_what_cannot_be_a_whole_state():
     """An array does not hold modes and discrete variables: declared starts took their places in silence."""
     system = sampled()
@@ -206,6 +213,10 @@ def test_what_cannot_be_a_whole_state():
         simulate(system, 1.0, initial=dataclasses.replace(state, x=state.x * jnp.nan))
     with pytest.raises(ModelError, match="3 saved times"):
         solution.at(3)
+    # One of another model with as many states went on, with one model's numbers for the other's.
+    foreign = dataclasses.replace(state, of=built_of("other").plan.digest_of_states)
+    with pytest.raises(ModelError, match=r"one of another model: here, it has c\.\w"):
+        simulate(system, 1.0, initial=foreign)
     # Inside jit, a time that is not the state's: not-a-number and a code.
     run = jax.jit(lambda t0: simulate(system, 1.0, t0=t0, ts=jnp.array([1.0]), initial=state).states)
     assert np.isfinite(run(0.5)).all() and np.isnan(run(0.25)).all()

@@ -36,7 +36,7 @@ class _Program:
     def _content(self) -> Content:
         return content(self._key)
 
-    def identified(self) -> tuple[str, tuple]:
+    def __content__(self) -> tuple[str, tuple]:
         """For `host/content.py`."""
         return self._content.digest, tuple(map(Hidden, self._content.unseen))
 
@@ -60,7 +60,7 @@ class _TracedFunction:
     jaxpr: Any = dataclasses.field(compare=False)
     program: _Program
 
-    def identified(self) -> tuple[str, tuple]:
+    def __content__(self) -> tuple[str, tuple]:
         """For `host/content.py`."""
         return "", (self.program,)
 
@@ -196,7 +196,7 @@ class _Primitive:
 
     primitive: Any
 
-    def identified(self) -> tuple[str, tuple]:
+    def __content__(self) -> tuple[str, tuple]:
         """For `host/content.py`."""
         kind = type(self.primitive)
         is_own = owner(getattr(getattr(self.primitive, "impl", None), "__module__", kind.__module__)) is Owner.KNOWN
@@ -215,6 +215,6 @@ class _Same:
     def __hash__(self) -> int:
         return id(self.value)
 
-    def identified(self) -> tuple[str, tuple]:
+    def __content__(self) -> tuple[str, tuple]:
         """For `host/content.py`."""
         return "", (self.value,)

@@ -80,7 +80,7 @@ class Stiffness:
     def __hash__(self) -> int:
         return 0  # all else that is static tells models apart
 
-    def identified(self) -> tuple[str, tuple]:
+    def __content__(self) -> tuple[str, tuple]:
         """For `host/content.py`: the decade."""
         return repr(self.decay), ()
 

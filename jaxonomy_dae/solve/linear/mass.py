@@ -46,7 +46,7 @@ class Mass:
     def __hash__(self):
         return hash(self._digest)
 
-    def identified(self) -> tuple[str, tuple]:
+    def __content__(self) -> tuple[str, tuple]:
         """For `host/content.py`."""
         return self._digest, ()
 

@@ -69,7 +69,7 @@ class SparsePattern:
     def __hash__(self):
         return hash(self.digest)
 
-    def identified(self) -> tuple[str, tuple]:
+    def __content__(self) -> tuple[str, tuple]:
         """For `host/content.py`."""
         return self.digest, ()
 
