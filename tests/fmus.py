@@ -88,6 +88,6 @@ def problems(path: Path) -> list[str]:
 
 
 def run(path: Path, t1: float, output: Sequence[str], rtol: float = 1e-9, **options: Any) -> Any:
-    """A run by FMPy's CVode."""
-    given = {"output_interval": t1 / 50, "solver": "CVode"} | options
+    """A run by FMPy's CVode, or by the FMU itself: `fmi_type="CoSimulation"`."""
+    given = {"output_interval": t1 / 50, "solver": "CVode", "fmi_type": "ModelExchange"} | options
     return fmpy.simulate_fmu(str(path), stop_time=t1, relative_tolerance=rtol, output=list(output), **given)

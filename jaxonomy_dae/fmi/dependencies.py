@@ -32,10 +32,11 @@ def dependencies(program: Any, given: Sequence[Rows | None], n: int) -> list[Row
     """For each result of a program (a `ClosedJaxpr`), a matrix of booleans, shape (entries, n): the columns that each
     entry depends on. `given` has such a matrix for each argument, None for one that depends on nothing."""
     with jax.ensure_compile_time_eval():
-        return _of_program(straight(program.jaxpr), [*(None for _ in program.consts), *given], list(program.consts), n)
+        return _closed(program, given, (), n)
 
 
-def _of_program(program: Straight, given: Sequence[Any], constants: Sequence[Any], n: int) -> list[Rows]:
+def _of_program(inside: Any, given: Sequence[Any], constants: Sequence[Any], n: int) -> list[Rows]:
+    program = straight(inside, [None if c is None else known(c).value for c in constants])
     found: dict[int, Rows | None] = dict(zip(program.arguments, given, strict=True))
     values: dict[int, np.ndarray] = {
         a: known(c).value for a, c in zip(program.arguments, constants, strict=False) if c is not None
@@ -52,11 +53,10 @@ def _of_program(program: Straight, given: Sequence[Any], constants: Sequence[Any
         kinds = [program.kinds[r] for r in operation.results]
         if all(r is None for r in read):
             results: list[Any] = [None] * len(kinds)
-            values.update(_computed(operation, [value(a) for a in operation.given], kinds))
         elif operation.primitive in CALLS:
             inner, closed = function_of(operation)
             known_values = [*closed, *(value(a) for a in operation.given)]
-            results = _of_program(straight(inner), [*(None for _ in closed), *read], known_values, n)
+            results = _of_program(inner, [*(None for _ in closed), *read], known_values, n)
         elif operation.primitive in _CONTROL:
             results = _CONTROL[operation.primitive](
                 operation.params, read, [value(a) for a in operation.given], kinds, n
@@ -67,21 +67,10 @@ def _of_program(program: Straight, given: Sequence[Any], constants: Sequence[Any
     return [_whole(of(a), program.kind(a).size, n) for a in program.results]
 
 
-def _computed(operation: Operation, given: Sequence[np.ndarray | None], kinds: Sequence[Any]) -> dict[int, np.ndarray]:
-    """The results of an operation on known integers, such as the places that a gather reads."""
-    if any(v is None for v in given) or any(np.dtype(kind.dtype).kind not in "iub" for kind in kinds):
-        return {}
-    if operation.primitive not in (*ELEMENTWISE, *MOVES, "iota"):
-        return {}
-    found = operation.source_primitive.bind(*map(jnp.asarray, given), **operation.params)
-    results = found if operation.source_primitive.multiple_results else [found]
-    return {number: np.asarray(v) for number, v in zip(operation.results, results, strict=True)}
-
-
 def _closed(program: Any, read: Sequence[Rows | None], values: Sequence[np.ndarray | None], n: int) -> list[Rows]:
     """What the results of a closed program depend on, given what is known of the values of its first arguments."""
     given = [*(None for _ in program.consts), *read]
-    return _of_program(straight(program.jaxpr), given, [*program.consts, *values], n)
+    return _of_program(program.jaxpr, given, [*program.consts, *values], n)
 
 
 def _together(a: Rows | None, b: Rows | None) -> Rows | None:

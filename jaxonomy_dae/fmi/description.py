@@ -74,19 +74,21 @@ def _read(unit: str) -> Unit | None:
 
 
 def model_description(
-    model: str, identifier: str, token: str, variables: Sequence[Variable], structure: Structure, steps: bool,
-    stop: float, tolerance: float,
+    model: str, identifier: str, token: str, variables: Sequence[Variable], structure: Structure, completed: bool,
+    co_simulation: bool, stop: float, tolerance: float,
 ) -> str:  # fmt: skip
-    """The XML text; the place of a variable is its value reference. `steps` says whether integrators must tell of
-    completed steps."""
+    """The XML text; the place of a variable is its value reference. `completed` says whether integrators must tell
+    of completed steps."""
+    abilities = (
+        f'modelIdentifier="{identifier}" canGetAndSetFMUState="true" canSerializeFMUState="true" '
+        'providesDirectionalDerivatives="true" providesAdjointDerivatives="true"'
+    )
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<fmiModelDescription fmiVersion="3.0" modelName={quoteattr(model)} instantiationToken="{token}" '
         'generationTool="jaxonomy_dae" variableNamingConvention="structured">',
-        f'  <ModelExchange modelIdentifier="{identifier}" canGetAndSetFMUState="true" canSerializeFMUState="true" '
-        'providesDirectionalDerivatives="true" providesAdjointDerivatives="true"'
-        + ' needsCompletedIntegratorStep="true"' * steps
-        + "/>",
+        f"  <ModelExchange {abilities}" + ' needsCompletedIntegratorStep="true"' * completed + "/>",
+        *([f'  <CoSimulation {abilities} canHandleVariableCommunicationStepSize="true"/>'] if co_simulation else []),
         *_units(variables),
         '  <LogCategories><Category name="logStatusError"/><Category name="logStatusDiscard"/></LogCategories>',
         f'  <DefaultExperiment startTime="0" stopTime="{_number(stop)}" tolerance="{_number(tolerance)}"/>',

@@ -161,13 +161,13 @@ class Body:
         self._alias: dict[int, int] = {}
         self._values: dict[int, Value] = {}
         self._constants: dict[int, Constant] = {}  # what the program closes over
-        self._declared: list[str] = []  # the names of local values
+        self._declared: dict[str, int] = {}  # the names of local values, and how often they stand where they are made
         self._inputs: list[str] = []  # the names of arguments
         self._group: list[Operation] = []
-        self._last = self._last_uses()
         own = program.arguments[len(closed) :]
         for number_, constant in zip(program.arguments, closed, strict=False):
             self._constants[number_] = constant
+        self._last = self._last_uses()
         for k, argument in enumerate(own):
             self._inputs.append(f"a{k}")
             self._values[argument] = Value(f"a{k}", program.kinds[argument])
@@ -238,7 +238,7 @@ class Body:
 
     def _declare(self, name: str, kind: Kind, owner: int | None) -> None:
         size = max(kind.size, 1) * np.dtype(kind.dtype).itemsize
-        self._declared.append(name)
+        self._declared[name] = 2
         if kind.size <= SHORT and self.local + size <= LOCAL:
             self.local += size
             self.line(f"{c_type(kind.dtype)} {name}[{max(kind.size, 1)}];")
@@ -279,7 +279,9 @@ class Body:
         operations = self.program.operations
         for k, operation in enumerate(operations):
             reads = [self._root(a) for a in operation.given if isinstance(a, int)]
-            if operation.primitive in ALIASES and isinstance(operation.given[0], int):
+            is_alias = operation.primitive in ALIASES and isinstance(operation.given[0], int)
+            if is_alias or self._is_part(operation):
+                assert isinstance(operation.given[0], int)
                 self._alias[operation.results[0]] = self._root(operation.given[0])
             last.update(dict.fromkeys(reads, k))
         last.update({self._root(a): len(operations) for a in self.program.results if isinstance(a, int)})
@@ -287,7 +289,9 @@ class Body:
 
     def _result_places(self) -> dict[int, int]:
         """Arrays that are computed where a result is wanted, so that they need not be copied."""
-        computed = {r for o in self.program.operations if o.primitive not in ALIASES for r in o.results}
+        computed = {
+            r for o in self.program.operations if o.primitive not in ALIASES and not self._is_part(o) for r in o.results
+        }
         places: dict[int, int] = {}
         for k, atom in enumerate(self.program.results):
             if isinstance(atom, int) and atom in computed and self.program.kinds[atom].shape:
@@ -322,7 +326,7 @@ class Body:
         words = collections.Counter(_words("\n".join(self.lines)))
         self.lines = [line.replace("w + @OWN@", f"w + {self.own}" if self.own else "w") for line in self.lines]
         quiet = [name for name in (*self._inputs, "w") if name not in words]
-        quiet += [name for name in self._declared if words[name] <= 2]  # what reads them is empty
+        quiet += [name for name, n in self._declared.items() if words[name] <= n]  # what reads them is empty
         self.lines += [f"(void){name};" for name in quiet]
 
     @property
@@ -333,9 +337,15 @@ class Body:
         name, kinds = operation.primitive, [self.program.kinds[r] for r in operation.results]
         pending = {r for o in self._group for r in o.results}
         reads_pending = any(isinstance(a, int) and self._root(a) in pending for a in operation.given)
-        if self._is_entrywise(operation):
+        picks = self._picks(operation)
+        if self._is_entrywise(operation) or picks is not None:
+            if picks is not None and reads_pending:
+                self._flush()
             if not kinds[0].shape:
-                text = self._cell(operation, [self.value(a).text for a in operation.given])
+                if picks is None:
+                    text = self._cell(operation, [self.value(a).text for a in operation.given])
+                else:
+                    text = self.value(operation.given[0]).at(str(int(picks)))
                 self._scalar(operation.results[0], kinds[0], text)
                 return
             if self._group and self.program.kinds[self._group[0].results[0]].shape != kinds[0].shape:
@@ -344,11 +354,25 @@ class Body:
             return
         if reads_pending:
             self._flush()
+        if name == "slice" and self._is_part(operation):
+            given, inner = self.value(operation.given[0]), int(np.prod(kinds[0].shape[1:], dtype=int))
+            begin = operation.params["start_indices"][0] * inner
+            self._values[operation.results[0]] = Value(f"({given.text} + {begin})" if begin else given.text, kinds[0])
+            return
         if name in ALIASES:
             given = self.value(operation.given[0])
             self._alias_of(operation.results[0], given, kinds[0])
             return
         self._other(operation, kinds)
+
+    def _is_part(self, operation: Operation) -> bool:
+        """True for a slice whose entries stand together in what it is cut from."""
+        if operation.primitive != "slice" or not isinstance(operation.given[0], int):
+            return False
+        if operation.given[0] in self._constants or any(step != 1 for step in operation.params["strides"] or ()):
+            return False
+        shape, out = self.program.kind(operation.given[0]).shape, self.program.kinds[operation.results[0]].shape
+        return shape[1:] == out[1:] and 0 not in shape
 
     def _alias_of(self, result: int, given: Value, kind: Kind) -> None:
         if bool(given.kind.shape) == bool(kind.shape):
@@ -356,7 +380,7 @@ class Body:
         elif kind.shape:  # one entry that was a scalar
             name = self.name()
             self.line(f"const {c_type(kind.dtype)} {name}[1] = {{{given.text}}};")
-            self._declared.append(name)
+            self._declared[name] = 1
             self._values[result] = Value(name, kind)
         else:
             self._values[result] = Value(f"{given.text}[0]", kind)
@@ -364,8 +388,38 @@ class Body:
     def _scalar(self, result: int, kind: Kind, text: str) -> None:
         name = self.name()
         self.line(f"const {c_type(kind.dtype)} {name} = {text};")
-        self._declared.append(name)
+        self._declared[name] = 1
         self._values[result] = Value(name, kind)
+
+    def _picks(self, operation: Operation) -> np.ndarray | None:
+        """For a gather that picks single entries at known places, and for a slice of a vector: their numbers in the
+        shape of the result."""
+        if operation.primitive == "slice":
+            (begin, *others), (end, *_) = operation.params["start_indices"], operation.params["limit_indices"]
+            step = (operation.params["strides"] or (1,))[0]
+            return None if others or end <= begin or self._is_part(operation) else np.arange(begin, end, step)
+        if operation.primitive != "gather":
+            return None
+        places, numbers = self.known(operation.given[1]), operation.params["dimension_numbers"]
+        shape, sizes = self.program.kind(operation.given[0]).shape, operation.params["slice_sizes"]
+        whole = tuple(range(len(shape)))
+        if places is None or numbers.collapsed_slice_dims != whole or numbers.start_index_map != whole or not shape:
+            return None
+        if any(n != 1 for n in sizes) or not places.value.size:
+            return None
+        inside = (places.value >= 0) & (places.value < np.array(shape))
+        if not inside.all():
+            return None
+        return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(places.value, -1, 0)), shape))
+
+    def _picked(self, operation: Operation, picks: np.ndarray) -> str:
+        """The entry that a gather picks in the loop over i."""
+        source, flat = self.value(operation.given[0]), picks.ravel()
+        step = int(flat[1] - flat[0]) if len(flat) > 1 else 0
+        if (np.diff(flat) == step).all():
+            place = f"{int(flat[0])} + i * {step}" if step != 1 else f"{int(flat[0])} + i"
+            return source.at(place if step else str(int(flat[0])))
+        return source.at(f"{self.source.table(flat.astype(np.int32))}[i]")
 
     def _is_entrywise(self, operation: Operation) -> bool:
         """True for operations entry by entry, and for those that repeat a scalar."""
@@ -434,7 +488,11 @@ class Body:
             for operation in group:
                 (result,) = operation.results
                 own = self.program.kinds[result]
-                text = self._cell(operation, [entry(a) for a in operation.given])
+                picks = self._picks(operation)
+                if picks is not None:
+                    text = self._picked(operation, picks)
+                else:
+                    text = self._cell(operation, [entry(a) for a in operation.given])
                 inside[result] = name = self.name()
                 self.line(f"const {c_type(own.dtype)} {name} = {text};")
                 if result in stored:
@@ -470,7 +528,7 @@ class Body:
                 ARRAY_OPERATIONS[name](self, operation.params, given, results)
             except NotImplementedError:
                 raise self._refused(operation) from None
-        self._declared += [v.text for r, v in zip(operation.results, results, strict=True) if r not in self._place]
+        self._declared |= {v.text: 2 for r, v in zip(operation.results, results, strict=True) if r not in self._place}
 
     def apply(self, program: Any, given: Sequence[Value], results: Sequence[Value]) -> None:
         """Calls a program with values."""

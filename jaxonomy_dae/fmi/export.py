@@ -25,7 +25,8 @@ from .model_c import CVariable, Layout, model_files
 from .programs import Programs, check_exportable
 
 SOURCE = "fmi3_model_exchange.c"
-INFINITE = (-math.inf, math.inf)
+KINDS = ("model_exchange", "co_simulation")
+CO_SIMULATION_UPTO = 300  # states: a step factorizes a dense matrix, 27 million multiplications at this size
 
 
 def export_fmu(
@@ -34,12 +35,14 @@ def export_fmu(
     *,
     outputs: Sequence[str] | None = None,
     parameters: Sequence[str] | str = "all",
+    kinds: Sequence[str] | None = None,
     platforms: Sequence[str] | str | None = None,
     stop_time: float = 1.0,
     tolerance: float = 1e-6,
     overwrite: bool = False,
 ) -> Path:
-    """Writes a system as a Functional Mock-up Unit: FMI 3.0, Model Exchange, with C sources.
+    """Writes a system as a Functional Mock-up Unit: FMI 3.0, Model Exchange and Co-Simulation, with C
+    sources.
 
     An importer (Simulink, OpenModelica, FMPy, …) integrates it without Python. It computes what `simulate` computes:
     the same equations, networks and functions, events by the same map, and consistent starts. Directional and adjoint
@@ -52,6 +55,9 @@ def export_fmu(
         model.
     - `parameters`: the parameters, arrays of parameters and networks that an importer may set. `"all"`: each of them.
         Others keep the values of `system`. Those that only the start reads are `fixed`, others are `tunable`.
+    - `kinds`: `"model_exchange"` is always there. `"co_simulation"` adds a solver, Rodas5P, with error control by the
+        importer's tolerance, events, and dense factorizations of up to 300 states. None: it is added if there are no
+        more states.
     - `platforms`: for which platforms binaries are made, as `"x86_64-windows"`; `"all"` for all that are known. Those
         of other machines need the package `ziglang`. None: this machine's, if there is a compiler. `()`: sources only.
     - `stop_time` (second), `tolerance`: the default experiment. Where an importer gives no tolerance, states are moved
@@ -86,8 +92,9 @@ def export_fmu(
         elif chosen is not None:
             raise ModelError(f"there is no C compiler for {name} on this machine: install one, or give platforms=()")
     files, description, identifier = fmu_files(
-        system, target.stem, outputs=outputs, parameters=parameters, stop_time=stop_time, tolerance=tolerance
-    )
+        system, target.stem, outputs=outputs, parameters=parameters, kinds=kinds, stop_time=stop_time,
+        tolerance=tolerance,
+    )  # fmt: skip
     contents = {"modelDescription.xml": description.encode(), "sources/buildDescription.xml": _build(identifier)}
     contents |= {f"sources/{name}": text.encode() for name, text in files.items()}
     for name, command in commands.items():
@@ -122,12 +129,21 @@ def _build(identifier: str) -> bytes:
 
 def fmu_files(
     system: AcausalSystem, stem: str, *, outputs: Sequence[str] | None = None, parameters: Sequence[str] | str = "all",
-    stop_time: float = 1.0, tolerance: float = 1e-6,
+    kinds: Sequence[str] | None = None, stop_time: float = 1.0, tolerance: float = 1e-6,
 ) -> tuple[dict[str, str], str, str]:  # fmt: skip
     """The C files by name, `modelDescription.xml`, and the identifier of the model."""
     check_exportable(system)
     system = system.merged().without_stiffness
-    model = _Model(system, outputs, parameters)
+    if kinds is not None and (unknown := set(kinds) - set(KINDS)):
+        raise ModelError(f"kinds: '{min(unknown)}' is not known; there are {', '.join(KINDS)}")
+    small = len(system.states) <= CO_SIMULATION_UPTO
+    co_simulation = small if kinds is None else "co_simulation" in kinds
+    if co_simulation and not small:
+        raise ModelError(
+            f"kinds: Co-Simulation factorizes dense matrices of up to {CO_SIMULATION_UPTO} states, and this model has "
+            f"{len(system.states)}: export it for Model Exchange, kinds=['model_exchange']"
+        )
+    model = _Model(system, outputs, parameters, co_simulation)
     identifier = re.sub(r"\W", "_", stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"m_{identifier}"
 
@@ -135,8 +151,8 @@ def fmu_files(
 
     def description(token: str) -> str:
         return model_description(
-            system.plan.flat.name or stem, identifier, token, model.variables, structure, model.needs_steps, stop_time,
-            tolerance,
+            system.plan.flat.name or stem, identifier, token, model.variables, structure, model.needs_steps,
+            model.programs.steps, stop_time, tolerance,
         )  # fmt: skip
 
     files = model_files(
@@ -151,7 +167,9 @@ def fmu_files(
 class _Model:
     """The variables of an FMU, and where they stand."""
 
-    def __init__(self, system: AcausalSystem, outputs: Sequence[str] | None, parameters: Sequence[str] | str):
+    def __init__(
+        self, system: AcausalSystem, outputs: Sequence[str] | None, parameters: Sequence[str] | str, steps: bool
+    ):  # fmt: skip
         self.system, self.plan = system, system.plan
         states = system.states
         flat = self.plan.flat.variables
@@ -162,7 +180,7 @@ class _Model:
         self.output_states = [n for n in wanted if n in states]
         self.output_discretes = [n for n in wanted if n in self.discretes]
         own = {*states, *self.discretes, *system.inputs}
-        self.programs = Programs(system, [n for n in wanted if n not in own], fixed)
+        self.programs = Programs(system, [n for n in wanted if n not in own], fixed, steps)
         self.layout = Layout.of(self.programs)
         self.parameter_names, self.weights = self._parameters(parameters)
         self._traced = self.programs.traced

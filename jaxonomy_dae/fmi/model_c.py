@@ -16,6 +16,11 @@ from .programs import RUN, Programs
 # an importer's integrator. A hundredth stays far below the errors of steps.
 DRIFT = 0.01
 
+# Of Co-Simulation. Its absolute tolerance is a part of the tolerance and of a state's typical size, the ratio of the
+# defaults of `simulate`; guards are looked at so many times in a step, as often as there.
+ABSOLUTE = 0.01
+LOOKS = 6
+
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
@@ -93,12 +98,13 @@ def model_files(
         "NX": programs.nx, "NZ": programs.nz, "NY": programs.ny, "NG": programs.ng, "NC": programs.nc,
         "ND": layout.size, "N_VARIABLES": len(variables), "N_ROWS": len(names["rows"]),
         "N_EVENTS": len(names["events"]), "WORK": max(f.work for f in functions.values()),
+        "CO_SIMULATION": int(programs.steps), "LOOKS": LOOKS, "ENDED_AT": 2, "STUCK_AT": 3,
         "AT_T": layout["t"], "AT_X": layout["x"], "AT_Z": layout["z"], "AT_GUARDS": layout["guards"],
-        "AT_CLOCKS": layout["clocks"], "AT_RUN": layout["run"], "ENDED_AT": 2, "STUCK_AT": 3,
+        "AT_CLOCKS": layout["clocks"], "AT_RUN": layout["run"],
     }  # fmt: skip
     reals = {
         "TOLERANCE": tolerance, "DRIFT": DRIFT, "RESOLUTION": RESOLUTION * EPS, "BAND": BAND * EPS, "ABOVE": ABOVE,
-        "RESTS": RESTS,
+        "RESTS": RESTS, "ABSOLUTE": ABSOLUTE,
     }  # fmt: skip
     header = (
         "/* The sizes of the model. */\n#ifndef MODEL_H\n#define MODEL_H\n\n"
@@ -154,6 +160,7 @@ def _wrapper(programs: Programs, layout: Layout, name: str, function: CFunction)
         "start": "double *d, double resolution, unsigned char *fine, double *residual, double *limit",
         "event": "const double *d, double resolution, double tolerance, double *next, unsigned char *fired, "
         "unsigned char *fine",
+        "step": "const double *d, double h, double *x, double *error, double *dense",
         "accept": "const double *d, double resolution, double tolerance, double step, double *next, "
         "unsigned char *wants",
     }.get(name, "const double *d, double *out")
@@ -165,6 +172,7 @@ def _wrapper(programs: Programs, layout: Layout, name: str, function: CFunction)
             *results("d", ["x", "z", "q", "guards", "clocks", "run"]), "fine", "residual", "limit",
         ],
         "event": [*point, *memory, *own, *results("next", ["x", "z", "q", "guards", "clocks", "run"]), "fired", "fine"],
+        "step": [*point, "h", *own, "x", "error", "dense"],
         "accept": [*point, *memory, "step", *own, *results("next", ["z", "guards", "run"]), "wants"],
     }  # fmt: skip
     arguments = given.get(name, [*point, *own, "out"])

@@ -9,6 +9,7 @@ blocks, discrete values, parameters, inputs, and the arrays of networks. `Progra
   *weights). Nonlinear blocks are differentiated by the implicit function theorem.
 - `start`: the consistent point at the initial time, after the events that happen there.
 - `event`: what happens at an instant, by the map that a run uses.
+- `step`: a step of Rodas5P, with its error and its dense output, for Co-Simulation.
 - `accept`: what a step that was completed leaves behind: tearing variables, on which side of zero guards are, how far
   states are off their constraints.
 """
@@ -18,6 +19,7 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -39,6 +41,7 @@ from ..solve.events.problem import HybridState
 from ..solve.events.side import ABOVE, BELOW, RESTS, rounding
 from ..solve.events.solver import MOVED
 from ..solve.events.start import start
+from ..solve.methods.rodas5p import Rodas5P
 from ..write.events import EventFlag
 
 PROJECTIONS = 4  # Gauss–Newton steps onto the constraints, as many as leave rounding of any drift that is tolerated
@@ -55,10 +58,10 @@ class Weights:
 
 class Programs:
     """The functions of a system, whose continuous `outputs` are variables by name, and whose `starts` are variables
-    with values that can be set at the initial time."""
+    with values that can be set at the initial time; `steps` says whether there is a step of a solver."""
 
-    def __init__(self, system: AcausalSystem, outputs: Sequence[str], starts: Sequence[str]):
-        self.system, self.plan = system, system.plan
+    def __init__(self, system: AcausalSystem, outputs: Sequence[str], starts: Sequence[str], steps: bool = True):
+        self.system, self.plan, self.steps = system, system.plan, steps
         self.nx, self.nz = len(self.plan.states), len(self.plan.carried)
         self.starts = tuple(starts)
         self._quantity = self.plan.resolve(outputs) if outputs else (np.zeros(0, np.int64), np.zeros(0))
@@ -235,6 +238,15 @@ class Programs:
             of_guards, of_run = state.of_guards, state.of_run
         return whole[self.nx :], of_guards, of_run, wants
 
+    def step(self, t: Array, x: Array, z: Array, q: Array, p: Array, u: Array, h: Array, *weights: Array) -> Any:
+        """A step of length h. Returns (x after it, its error, shape (nx,) each, and the coefficients of the dense
+        output, shape (3, nx))."""
+        if not self.nx:
+            return x, x, jnp.zeros((3, 0), p.dtype)
+        term = diffrax.ODETerm(lambda t, x, args: self.field(jnp.asarray(t), x, z, q, p, u, *weights))
+        x1, error, dense, _, _ = Rodas5P(looped=True).step(term, t, t + h, x, None, None, made_jump=False)
+        return x1, error, dense["k"]
+
     def _drift(self, system: AcausalSystem, t: Array, whole: Array, args: Any, tolerance: Array) -> Array:
         """How far the states are from their constraints, in units of what is tolerated."""
         moved = system.project(t, whole, args)[: self.nx] - whole[: self.nx]
@@ -279,8 +291,11 @@ class Programs:
             ),
             "start": (self.start, (number, n["p"], n["u"], n["s"], number, *weights)),
             "event": (self.event, (*point, *memory, *weights)),
+            "step": (self.step, (*point, number, *weights)),
             "accept": (self.accept, (*point, *memory, number, *weights)),
         }
+        if not self.steps:
+            del given["step"]
         return {name: jax.make_jaxpr(function)(*arguments) for name, (function, arguments) in given.items()}
 
 

@@ -5,6 +5,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -19,6 +21,13 @@ CALLS = {
     "custom_vjp_call_jaxpr": "fun_jaxpr", "custom_vmap_call": "call",
 }  # fmt: skip
 WHOLE = {"unvmap_any": "reduce_or", "unvmap_all": "reduce_and", "unvmap_max": "reduce_max"}
+# Operations on known integers that are done at once: they compute the places that gathers read.
+FOLDED = {
+    "iota", "lt", "le", "gt", "ge", "eq", "ne", "add", "sub", "mul", "select_n", "convert_element_type", "clamp",
+    "broadcast_in_dim", "reshape", "squeeze", "concatenate", "slice", "stack", "split", "transpose", "min", "max",
+    "and", "or", "not", "gather",
+}  # fmt: skip
+PLACES = {"gather", "scatter", "scatter-add", "scatter_add", "scatter-mul", "scatter-min", "scatter-max"}
 # Primitives that return what they are given.
 SAME = {"optimization_barrier", "stop_gradient", "copy", "name", "device_put", "sharding_constraint"}
 
@@ -87,9 +96,10 @@ def open_program(program: Any) -> tuple[Any, Sequence[Any]]:
     return (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, ())
 
 
-def straight(program: Any) -> Straight:
-    """The operations of a program (`jax.core.Jaxpr`); its closed-over values are its first arguments."""
-    return _Reader().read(program)
+def straight(program: Any, values: Sequence[np.ndarray | None] = ()) -> Straight:
+    """The operations of a program (`jax.core.Jaxpr`); its closed-over values are its first arguments. `values` has the
+    first arguments, as far as they are known."""
+    return _Reader().read(program, values)
 
 
 class _Reader:
@@ -98,13 +108,16 @@ class _Reader:
     def __init__(self):
         self.kinds: list[Kind] = []
         self.operations: list[Operation] = []
+        self.integers: dict[int, np.ndarray] = {}  # values that are known
 
     def new(self, aval: Any) -> int:
         self.kinds.append(Kind.of(aval))
         return len(self.kinds) - 1
 
-    def read(self, program: Any) -> Straight:
+    def read(self, program: Any, values: Sequence[np.ndarray | None]) -> Straight:
         arguments = tuple(self.new(v.aval) for v in (*program.constvars, *program.invars))
+        known_ones = zip(arguments, values, strict=False)
+        self.integers.update({a: v for a, v in known_ones if v is not None and v.dtype.kind in "iub"})
         results = self.inside(program, arguments)
         return Straight(arguments, _needed(self.operations, results), results, self.kinds)
 
@@ -141,9 +154,25 @@ class _Reader:
             if name in WHOLE:  # of Equinox: without `vmap`, a reduction of all entries
                 name, params = WHOLE[name], {"axes": tuple(range(len(equation.invars[0].aval.shape)))}
             results = tuple(self.new(v.aval) for v in equation.outvars)
+            if name in FOLDED:
+                self._fold(equation, read, results)
+            if name in PLACES and isinstance(read[1], int) and read[1] in self.integers:
+                read = (read[0], Constant(self.integers[read[1]]), *read[2:])
             self.operations.append(Operation(name, params, read, results, equation.source_info, equation.primitive))
             at.update(zip(equation.outvars, results, strict=True))
         return tuple(map(atom, program.outvars))
+
+    def _fold(self, equation: Any, read: Sequence[Atom], results: Sequence[int]) -> None:
+        """Notes the values of results that follow from known integers."""
+        if any(getattr(self.kinds[r].dtype, "kind", "V") not in "iub" for r in results):
+            return
+        values = [a.value if isinstance(a, Constant) else self.integers.get(a) for a in read]
+        if any(v is None for v in values):
+            return
+        with jax.ensure_compile_time_eval():
+            found = equation.primitive.bind(*map(jnp.asarray, values), **equation.params)
+        all_found = found if equation.primitive.multiple_results else [found]
+        self.integers.update(zip(results, map(np.asarray, all_found), strict=True))
 
 
 def _of_processor(platforms: Sequence[Sequence[str] | None]) -> int:

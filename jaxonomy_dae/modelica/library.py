@@ -50,6 +50,10 @@ class Library:
         """rumoca with the sources of the library, which it reads once."""
         return FrontEnd(self.sources)
 
+    @functools.cached_property
+    def _names(self) -> Sources:
+        return Sources(self.sources)
+
     def __getitem__(self, name: str) -> type[OpenComponent]:
         return self.component(name)
 
@@ -89,7 +93,7 @@ class Library:
 
     def _check_known(self, name: str) -> None:
         """Names what is near a class that no root holds, before the front end reads the whole library."""
-        sources = Sources(self.sources)
+        sources = self._names
         try:
             if isinstance(sources.find(name), Found):
                 return

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .complete import completed
+from .external_objects import with_external_objects
 from .flat_model import FlatModel, flat_of
 from .front_end import FrontEnd
 from .left_out import LEFT_OUT
@@ -50,7 +51,7 @@ def load(source: str | Path, model: str | None = None, roots: Sequence[str | Pat
 def _by_rumoca(text: str, file: Path | None, model: str | None, roots: Sequence[str | Path]) -> FlatModel:
     found = FrontEnd(roots).flatten(text, model, file)
     name = found.name.rpartition(".")[2]
-    flat = read_rumoca(found.dae, name)
+    flat = with_external_objects(read_rumoca(found.dae, name), found.flat)
     annotation = _annotation(text, name)
     return dataclasses.replace(flat, model=flat.model._replace(annotation=annotation))
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ..base.errors import ModelError
+from .external_objects import with_external_objects
 from .flat_model import FlatModel
 from .front_end import Flattened
 from .read_rumoca import read_open
@@ -67,15 +68,18 @@ def opened(name: str, found: Flattened) -> OpenClass:
         raise ModelError(f"'{name}' is partial: open a class that extends it, or write one as source=…")
     ports = tuple(p for top in found.flat["top_level_connectors"] for p in _ports(name, top, found.flat["variables"]))
     flows = [f"{port.name}.{flow}" for port in ports for flow, _ in port.flows]
-    flat = read_open(found.dae, name.rpartition(".")[2], flows)
+    flat = with_external_objects(read_open(found.dae, name.rpartition(".")[2], flows), found.flat)
     storage = found.dae["storage"]
     tunable, required, fixed = [], [], []
     roles: dict[str, list[str]] = {"input": [], "output": []}
     declared = {d.name: d for d in flat.model.declarations}
+    entries: dict[str, list[str]] = {}
+    for n in declared:
+        entries.setdefault(re.sub(r"\[[\d,]+\]$", "", n), []).append(n)
     for v in storage["variables"]:
         at = v["attributes"]
         is_real = storage["value_types"][v["value_type"]]["scalar"] == "real"
-        names = [n for n in declared if n == v["name"] or n.startswith(f"{v['name']}[")]
+        names = [v["name"]] if v["name"] in declared else entries.get(v["name"], [])
         if v["role"] == "parameter" and at.get("fixed") != [False]:
             free = is_real and at["is_tunable"] and not found.flat["variable_final_flags"].get(v["name"])
             (tunable if free else fixed).extend(names)

@@ -27,6 +27,8 @@ class OpenComponent(FlatComponent):
     - `ev`, `name`: as of every component.
     - `start`: values that variables must have at the initial time, by their names: numbers or expressions in
         parameters. Each is the parameter `"initial_" + name`.
+    - `numbers`: names of parameters, also of arrays, that are written as their values and cannot be changed. Where the
+        abscissae of a table are numbers, its look-ups at numbers need no choices.
     - `parameters`: values of Real parameters, by the names of the class: numbers, expressions in parameters of the
         parent, arrays for arrays. Those that the class gives no value are required.
 
@@ -38,7 +40,10 @@ class OpenComponent(FlatComponent):
 
     opened: ClassVar[OpenClass]
 
-    def __init__(self, ev: EqnEnv, name: str, /, *, start: Mapping[str, Any] | None = None, **parameters: Any):
+    def __init__(
+        self, ev: EqnEnv, name: str, /, *, start: Mapping[str, Any] | None = None, numbers: Sequence[str] = (),
+        **parameters: Any,
+    ):  # fmt: skip
         Component.__init__(self, ev, name)
         of = self.opened
         where = f"{of.name} '{name}'"
@@ -64,7 +69,8 @@ class OpenComponent(FlatComponent):
         types = {d.name: d.type for d in declared.values()}
         discrete = [n for n in of.outputs if types[n] != "Real"]
         flat = type(flat)(model, flat.classes)
-        scope = Scope(flat, self, given=given, signals={n for n in of.inputs if types[n] != "Real"})
+        signals = {n for n in of.inputs if types[n] != "Real"}
+        scope = Scope(flat, self, _numbers(of, numbers, where), given, signals)
         scope.known |= {n: v for n, v in given.items() if n not in declared}
         self._write(flat, scope, discrete)
         self._show_ports()
@@ -108,6 +114,15 @@ def _given(of: OpenClass, parameters: Mapping[str, Any], where: str) -> dict[str
             known = [*arrays, *of.fixed]
             raise ModelError(f"{where}: the class has no parameter '{name}': {nearest(name, known)}")
     return out
+
+
+def _numbers(of: OpenClass, names: Sequence[str], where: str) -> set[str]:
+    """The parameters that are written as numbers, those of arrays by their entries."""
+    found = {name: [n for n in of.tunable if n == name or n.startswith(f"{name}[")] for name in names}
+    for name, entries in found.items():
+        if not entries:
+            raise ModelError(f"{where}: numbers: the class has no parameter '{name}': {nearest(name, of.tunable)}")
+    return {n for entries in found.values() for n in entries}
 
 
 def _number(value: Any, name: str, where: str) -> float:

@@ -15,7 +15,8 @@ import sympy
 
 from ..base.errors import ModelError
 from ..write.component import Component
-from ..write.symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, der
+from ..write.events import terminate
+from ..write.symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, der
 from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter
@@ -23,7 +24,7 @@ from .kept_relations import KeptRelations
 from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
-from .tables import CONSTANT, EXTERNALS, LINEAR, SMOOTHNESS
+from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
 from .tree import Assignment, Branches, Declaration, Equality, Expression, Reference, Truth, entry_name
 from .values import Record, Value, as_number, both, is_condition, negated, plain
 
@@ -69,11 +70,14 @@ class Scope:
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
         self.random = RandomNumbers(component)
         self.interpreter = Interpreter(
-            flat.classes, self.value, special, LEFT_OUT | EXTERNALS | self.random.functions() | {ROOT: self._root},
+            flat.classes, self.value, special,
+            LEFT_OUT | EXTERNALS | self.random.functions() | {ROOT: self._root}
+            | {name: functools.partial(self._read_table, EXTERNALS[name]) for name in GET_VALUE},
             self.entries, self._named,
         )  # fmt: skip
         self.definitions = find_definitions(flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
+        self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.in_action = self.as_numbers = False
         self.final: dict[str, Value] = {}
         self.initial: DiscreteSymbol | None = None
@@ -217,7 +221,8 @@ class Scope:
         """What a Boolean or Integer variable is, in terms of what it depends on."""
         found = self.definitions.of.get(d.name)
         if d.name in self.signals:
-            signal = self.component.input(d.name)
+            is_declared = d.name in self.component.variables
+            signal = VariableSymbol(d.name) if is_declared else self.component.input(d.name)
             return sympy.Gt(signal, 0.5) if self.kind(d.type) == "Boolean" else sympy.floor(signal + 0.5)
         if found is None:  # an input of the model that nothing drives
             start = self._start(d.modifiers.get("start")) or self._least(d.type)
@@ -353,6 +358,17 @@ class Scope:
             return EXTERNALS[name](*map(self.evaluate, arguments))
         finally:
             self.as_numbers = False
+
+    def _read_table(self, read: Callable[..., Value], table: Table, column: int, u: Value, *more: Value) -> Value:
+        """The value of a table. One without extrapolation ends the run where it is read outside of its rows."""
+        outside = table.outside(u) if isinstance(u, sympy.Expr) and not self.in_action else False
+        outside = functools.reduce(both, self.interpreter.guards, outside)
+        if not isinstance(outside, bool) and outside not in self.ends and outside.atoms(VariableSymbol, TimeSymbol):
+            self.ends.add(outside)
+            first, last = table.rows[0, 0] + table.shift, table.rows[-1, 0] + table.shift
+            told = f"a table is read outside of [{first:g}, {last:g}], without extrapolation"
+            self.component.when(self.kept.in_events(outside), terminate(told), at_start=True)
+        return read(table, column, u, *more)
 
     def _pre(self, e: Expression) -> Value:
         value = self.evaluate(e)

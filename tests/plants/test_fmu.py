@@ -1,15 +1,18 @@
 """FMUs beside the systems that they were made of: runs by FMPy's CVode, derivatives, events, states that are saved."""
 
+import contextlib
 import math
 import subprocess
 import threading
 import zipfile
+from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cell_arrays import ladder
 from fmus import opened, problems, run
 from hybrid_models import Ball, Bob, Doubling, SampledPI, Stick, Thermostat
 from hybrid_models import compiled as hybrid
@@ -19,6 +22,7 @@ from jaxonomy_dae import Component, EqnEnv, der, simulate
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.fmi import export_fmu
 from jaxonomy_dae.fmi.compilers import FLAGS, compiler_for, this_platform
+from jaxonomy_dae.run.system.nonlinear import Refinement
 from jaxonomy_dae.write import Eq
 
 pytestmark = pytest.mark.skipif(compiler_for(this_platform()) is None, reason="no C compiler on this machine")
@@ -106,6 +110,9 @@ def test_a_ball_bounces_as_in_closed_form(ball):
     expected = np.array([bounces(1.0, 0.8, 9.81, t) for t in found["time"]])
     for k, name in enumerate(["b.h", "b.v", "b.n"]):
         np.testing.assert_allclose(found[name], expected[:, k], atol=1e-7)
+    found = run(ball, 2.0, ["b.h", "b.n"], fmi_type="CoSimulation")
+    np.testing.assert_allclose(found["b.h"], expected[:, 0], atol=1e-12)
+    np.testing.assert_array_equal(found["b.n"], expected[:, 2])
     found = run(ball, 1.0, ["b.h"], start_values={"b.h0": 2.0, "b.e": 0.5})
     np.testing.assert_allclose(found["b.h"][-1], bounces(2.0, 0.5, 9.81, 1.0)[0], atol=1e-7)
 
@@ -196,6 +203,8 @@ def test_what_cannot_be_exported_is_refused_by_name(tmp_path, ball):
         export_fmu(system, tmp_path / "x.fmu", parameters=["b.n"])
     with pytest.raises(ModelError, match="platforms: 'amiga' is not known"):
         export_fmu(system, tmp_path / "x.fmu", platforms="amiga")
+    with pytest.raises(ModelError, match="kinds: 'simulink' is not known"):
+        export_fmu(system, tmp_path / "x.fmu", kinds=["simulink"])
 
     def gamma(u):
         return jax.scipy.special.gammainc(2.0, u)
@@ -222,18 +231,18 @@ def point(system, fmu, outputs):
     values = [jnp.asarray(v[0]) for v in values] + leaves
     n, m, k = len(states), len(inputs), len(parameters)
 
+    discrete = jnp.asarray([*(fmu.get(name)[0] for name in system.discretes)])
+    q = jnp.concatenate([discrete, system.discrete_values[len(discrete) :]])
+    guess = system.initialize()[n:]
+
     def function(*given):
         t, x, u = given[0], jnp.stack(given[1 : 1 + n]), given[1 + n : 1 + n + m]
         p, w = given[1 + n + m : 1 + n + m + k], given[1 + n + m + k :]
         own = system.with_parameters(dict(zip(parameters, p, strict=True)))
         own = eqx.tree_at(lambda s: s.neural, own, eqx.combine(jax.tree.unflatten(tree, w), system.neural))
-        args = dict(zip(inputs, u, strict=True))
-        whole = own.at(t, args)
-        if system.carried:
-            from jaxonomy_dae.run.system.nonlinear import Refinement
-
-            guess = jnp.concatenate([x, jnp.ones(len(system.carried))])
-            x = whole.refined(guess, Refinement.ROOT)
+        own, args = own.holding(q), dict(zip(inputs, u, strict=True))
+        if len(guess):
+            x = own.at(t, args).refined(jnp.concatenate([x, guess]), Refinement.ROOT)
         return jnp.concatenate([own.vector_field(t, x, args)[:n], own.observe(outputs, t, x, args)])
 
     return unknowns, knowns, values, function
@@ -251,11 +260,11 @@ def check_derivatives(system, path, outputs, seed=0, rtol=1e-10):
         flat = np.concatenate([np.ravel(a) for a in along])
         np.testing.assert_allclose(fmu.get(*unknowns), value, rtol=1e-11, atol=1e-11)
         forward = fmu.forward(unknowns, knowns, flat)
-        scale = np.abs(slope).max()
+        scale = max(np.abs(slope).max(), 1e-300)
         np.testing.assert_allclose(forward / scale, slope / scale, atol=rtol)
         reverse = fmu.reverse(unknowns, knowns, weight, len(flat))
         expected = np.concatenate([np.ravel(b) for b in back])
-        scale = np.abs(expected).max()
+        scale = max(np.abs(expected).max(), 1e-300)
         np.testing.assert_allclose(reverse / scale, expected / scale, atol=rtol)
         both = weight @ forward, reverse @ flat
         assert abs(both[0] - both[1]) <= 1e-12 * max(np.abs(reverse * flat).sum(), np.abs(weight * forward).sum())
@@ -306,6 +315,7 @@ def test_a_pendulum_with_a_network(tmp_path, mode):
     check_derivatives(system, path, ["pend.lam"])
     t1 = 2.0 if mode == "auto" else 0.5
     compare(system, path, t1, ["pend.x", "pend.vy", "pend.lam"], 1e-6)
+    compare(system, path, t1, ["pend.x", "pend.vy", "pend.lam"], 1e-6, fmi_type="CoSimulation")
 
 
 @pytest.mark.slow
@@ -341,19 +351,80 @@ def test_runs_are_those_of_simulate(tmp_path, kind, names, t1):
     system = hybrid(kind, "c")
     path = exported(system, tmp_path)
     compare(system, path, t1, names, 1e-6)
+    compare(system, path, t1, names, 1e-6, fmi_type="CoSimulation")
     check_derivatives(system, path, [n for n in names if n not in system.discretes and n not in system.states])
 
 
 @pytest.mark.slow
-def test_many_instances_in_threads(ball):
-    def work(k, found):
-        with opened(ball, {"b.h0": 1.0 + k / 100}) as fmu:
-            found[k] = fmu.get("b.h", "der(b.v)")
+def test_instances_in_threads_do_not_see_each_other(ball):
+    """Each of 40 balls is dropped from a height of its own, and bounces 250 times at one place."""
+
+    def bounced(fmu, k):
+        speeds = []
+        for j in range(250):
+            fmu.model.enterContinuousTimeMode()
+            fmu.model.setTime(0.01 * (j + 1))
+            fmu.model.setContinuousStates(np.array([-1e-12, -1.0 - k]).ctypes.data_as(model_pointer()), 2)
+            fmu.model.completedIntegratorStep()
+            fmu.model.enterEventMode()
+            fmu.update()
+            speeds.append(fmu.get("b.v")[0])
+        return np.array(speeds)
 
     found: dict[int, np.ndarray] = {}
-    threads = [threading.Thread(target=work, args=(k, found)) for k in range(100)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert {k: tuple(v) for k, v in found.items()} == {k: (1.0 + k / 100, -9.81) for k in range(100)}
+    with contextlib.ExitStack() as stack:
+        instances = [stack.enter_context(opened(ball, {"b.h0": 1.0 + k / 100, "b.e": 0.5})) for k in range(40)]
+        threads = [threading.Thread(target=lambda k=k: found.update({k: bounced(instances[k], k)})) for k in range(40)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert [fmu.get("b.n")[0] for fmu in instances] == [250.0] * 40
+    for k in range(40):
+        np.testing.assert_allclose(found[k], 0.5 * (1.0 + k), rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind, least", [(Ball, 1000), (Thermostat, 50), (SampledPI, 200), (Stick, 3), (House, 0)])
+def test_sanitizers_find_nothing(tmp_path, kind, least):
+    """20,000 steps of Euler's method with events, derivatives and states that are saved, under the address and the
+    undefined-behaviour sanitizer, leaks included."""
+    with zipfile.ZipFile(exported(hybrid(kind, "c"), tmp_path)) as file:
+        file.extractall(tmp_path)
+    driver = Path(__file__).parent.parent / "fmu_driver.c"
+    command = [*(compiler_for(this_platform()) or ()), "-std=c99", "-O1", "-ffp-contract=off", "-Isources"]
+    sanitize = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    built = subprocess.run(
+        [*command, *sanitize, str(driver), "-o", "drive", "-lm"], cwd=tmp_path, capture_output=True, text=True
+    )
+    if "cannot find -lasan" in built.stderr:
+        pytest.skip("the compiler has no sanitizers")
+    assert not built.returncode, built.stderr
+    done = subprocess.run(["./drive", "20000", "1e-3"], cwd=tmp_path, capture_output=True, text=True)
+    assert not done.returncode, done.stdout + done.stderr
+    assert int(done.stdout.split()[-1]) >= least
+
+
+@pytest.mark.slow
+def test_a_large_array_stays_loops(tmp_path):
+    """The C code of 2,000 cells is hardly longer than that of 1,000, and every cell depends on its neighbours alone."""
+    sizes = []
+    for n in (1000, 2000):
+        path = exported(ladder(n, in_array=True), tmp_path, f"cells{n}", outputs=["cell[0].r.i"])
+        with zipfile.ZipFile(path) as file:
+            sizes.append(file.read("sources/model.c").decode().count(";"))
+    assert sizes[1] < 1.01 * sizes[0]
+    assert path.stat().st_size < 500_000
+    rng = np.random.default_rng(0)
+    with opened(path) as fmu:
+        derivatives = {u.variable.name: {v.name for v in u.dependencies} for u in fmu.description.derivatives}
+        for k in (1, 777, 1998):
+            own = {f"cell[{j}].c.v" for j in (k - 1, k, k + 1)}
+            own |= {f"cell[{k}].r.R", f"cell[{k + 1}].r.R", f"cell[{k}].c.C"}
+            assert derivatives[f"der(cell[{k}].c.v)"] == own
+        x = rng.normal(size=2000)
+        fmu.model.enterContinuousTimeMode()
+        fmu.model.setContinuousStates(x.ctypes.data_as(model_pointer()), 2000)
+        slopes = fmu.get(*(f"der(cell[{k}].c.v)" for k in range(2000)))
+    before, after = np.concatenate([[1.0], x[:-1]]), np.append(x[1:], x[-1])
+    np.testing.assert_allclose(slopes, before - x + after - x, atol=1e-12)

@@ -1,4 +1,4 @@
-/* Functional Mock-up Interface 3.0, Model Exchange: the functions that an importer calls, for any model.
+/* Functional Mock-up Interface 3.0, Model Exchange and Co-Simulation: the functions that an importer calls, for any model.
 
    model.h has the sizes of the model, model.c its tables and equations, token.h its identity. All numbers of an instance stand in one array
    `d` in the order of model.h, so that its state is copied as a whole. Nothing is allocated but instances and states. */
@@ -14,7 +14,7 @@
 #define N_UNKNOWNS (NX + NY + NG)
 #define ROOM(n) ((n) > 0 ? (n) : 1)
 
-typedef enum { INSTANTIATED, INITIALIZING, EVENT_MODE, CONTINUOUS_TIME, TERMINATED, FAILED } Mode;
+typedef enum { INSTANTIATED, INITIALIZING, EVENT_MODE, CONTINUOUS_TIME, STEP_MODE, TERMINATED } Mode;
 
 /* What a variable is: an entry of `d`, one of the unknowns (derivatives, outputs, guards), or an event indicator. */
 typedef enum { STORED, UNKNOWN, INDICATOR } Kind;
@@ -35,18 +35,23 @@ typedef struct {
 
 typedef struct {
   double d[ND];
-  double begin, stop, tolerance, last; /* `last`: the time of the last accepted step */
+  double begin, stop, tolerance;
+  double last;           /* the time of the last accepted step */
+  double next_event, step; /* of Co-Simulation: when a clock ticks next, and the length of the next step */
   int mode, started;
 } State;
 
 typedef struct {
   State s;
-  int valid; /* whether `unknowns` belongs to `s` */
+  int valid;   /* whether `unknowns` belongs to `s` */
+  int steps;   /* whether the instance integrates by itself */
   fmi3LogMessageCallback log;
   fmi3InstanceEnvironment environment;
   double unknowns[ROOM(N_UNKNOWNS)];
   double along[ND], weight[ROOM(N_UNKNOWNS)]; /* directions and weights of derivatives */
   double next[ND];
+  double begin_x[ROOM(NX)], end_x[ROOM(NX)], error[ROOM(NX)], dense[ROOM(3 * NX)];
+  double signs[ROOM(NG)];
   double work[WORK / 8 + 2];
 } Instance;
 
@@ -149,10 +154,7 @@ EXPORT fmi3Status fmi3SetDebugLogging(fmi3Instance i, fmi3Boolean on, size_t n, 
   return fmi3OK;
 }
 
-EXPORT fmi3Instance fmi3InstantiateModelExchange(
-    fmi3String name, fmi3String token, fmi3String path, fmi3Boolean visible, fmi3Boolean logging,
-    fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
-  (void)name; (void)path; (void)visible; (void)logging;
+static Instance *instance(fmi3String token, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
   if (!token || strcmp(token, TOKEN)) {
     if (log)
       log(environment, fmi3Error, "logStatusError",
@@ -167,14 +169,27 @@ EXPORT fmi3Instance fmi3InstantiateModelExchange(
   return m;
 }
 
+EXPORT fmi3Instance fmi3InstantiateModelExchange(
+    fmi3String name, fmi3String token, fmi3String path, fmi3Boolean visible, fmi3Boolean logging,
+    fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
+  (void)name; (void)path; (void)visible; (void)logging;
+  return instance(token, environment, log);
+}
+
 EXPORT fmi3Instance fmi3InstantiateCoSimulation(
     fmi3String name, fmi3String token, fmi3String path, fmi3Boolean visible, fmi3Boolean logging,
     fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference required[], size_t n,
     fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update) {
-  (void)name; (void)token; (void)path; (void)visible; (void)logging; (void)events; (void)early; (void)required;
-  (void)n; (void)update;
-  if (log) log(environment, fmi3Error, "logStatusError", "This FMU has Model Exchange only.");
-  return NULL;
+  (void)name; (void)path; (void)visible; (void)logging; (void)early; (void)required; (void)n; (void)update;
+  if (events || !CO_SIMULATION) {
+    if (log)
+      log(environment, fmi3Error, "logStatusError",
+          events ? "This FMU handles its events itself in Co-Simulation." : "This FMU has Model Exchange only.");
+    return NULL;
+  }
+  Instance *m = instance(token, environment, log);
+  if (m) m->steps = 1;
+  return m;
 }
 
 EXPORT fmi3Instance fmi3InstantiateScheduledExecution(
@@ -182,7 +197,7 @@ EXPORT fmi3Instance fmi3InstantiateScheduledExecution(
     fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3ClockUpdateCallback update,
     fmi3LockPreemptionCallback lock, fmi3UnlockPreemptionCallback unlock) {
   (void)name; (void)token; (void)path; (void)visible; (void)logging; (void)update; (void)lock; (void)unlock;
-  if (log) log(environment, fmi3Error, "logStatusError", "This FMU has Model Exchange only.");
+  if (log) log(environment, fmi3Error, "logStatusError", "This FMU has no Scheduled Execution.");
   return NULL;
 }
 
@@ -206,7 +221,7 @@ EXPORT fmi3Status fmi3ExitInitializationMode(fmi3Instance i) {
   Instance *m = i;
   if (m->s.mode != INITIALIZING) return wrong_mode(m, "fmi3ExitInitializationMode");
   const fmi3Status status = ensure_start(m);
-  if (status == fmi3OK) m->s.mode = EVENT_MODE;
+  if (status == fmi3OK) m->s.mode = m->steps ? STEP_MODE : EVENT_MODE;
   return status;
 }
 
@@ -411,7 +426,7 @@ EXPORT fmi3Status fmi3DeserializeFMUState(fmi3Instance i, const fmi3Byte bytes[]
 /* --- derivatives ------------------------------------------------------------------------------------------------- */
 
 static fmi3Status may_differentiate(Instance *m) {
-  if (m->s.mode == EVENT_MODE || m->s.mode == CONTINUOUS_TIME) return fmi3OK;
+  if (m->s.mode == EVENT_MODE || m->s.mode == CONTINUOUS_TIME || m->s.mode == STEP_MODE) return fmi3OK;
   return say(m, fmi3Error, "Derivatives exist after initialization.", "", "");
 }
 
@@ -547,13 +562,9 @@ EXPORT fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance i, size_t *n) {
   return fmi3OK;
 }
 
-EXPORT fmi3Status fmi3CompletedIntegratorStep(
-    fmi3Instance i, fmi3Boolean final, fmi3Boolean *enter_event_mode, fmi3Boolean *terminate) {
-  Instance *m = i;
+/* After a step: what it leaves behind, and whether an event is due. */
+static fmi3Status accepted(Instance *m, int *wants_event) {
   State *s = &m->s;
-  (void)final;
-  *enter_event_mode = *terminate = false;
-  if (s->mode != CONTINUOUS_TIME) return wrong_mode(m, "fmi3CompletedIntegratorStep");
   unsigned char wants = 0;
   memcpy(m->next, s->d, sizeof s->d);
   p_accept_of(s->d, resolution(s), s->tolerance * DRIFT, s->d[AT_T] - s->last, m->next, &wants, work_of(m));
@@ -562,23 +573,16 @@ EXPORT fmi3Status fmi3CompletedIntegratorStep(
       return say(m, fmi3Discard, "The equations have no solution here: ", CARRIED[k], " is not a number.");
   memcpy(s->d, m->next, sizeof s->d);
   s->last = s->d[AT_T];
-  *enter_event_mode = wants;
+  *wants_event = wants;
   return fmi3OK;
 }
 
-EXPORT fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance i) {
-  (void)i;
-  return fmi3OK;
-}
+typedef struct { int again, terminate, states, has_next; double next; } Update;
 
-EXPORT fmi3Status fmi3UpdateDiscreteStates(
-    fmi3Instance i, fmi3Boolean *again, fmi3Boolean *terminate, fmi3Boolean *nominals, fmi3Boolean *states,
-    fmi3Boolean *has_next, fmi3Float64 *next) {
-  Instance *m = i;
+/* What happens at the present instant. */
+static fmi3Status updated(Instance *m, Update *u) {
   State *s = &m->s;
-  *again = *terminate = *nominals = *states = *has_next = false;
-  *next = 0;
-  if (s->mode != EVENT_MODE) return wrong_mode(m, "fmi3UpdateDiscreteStates");
+  memset(u, 0, sizeof *u);
   unsigned char fired = 0, fine = 0;
   memcpy(m->next, s->d, sizeof s->d);
   p_event_of(s->d, resolution(s), s->tolerance * DRIFT, m->next, &fired, &fine, work_of(m));
@@ -590,42 +594,221 @@ EXPORT fmi3Status fmi3UpdateDiscreteStates(
   if (stuck < -1)
     return say(m, fmi3Error, "Two events give one variable different values at one instant.", "", "");
   if (!fine) return say(m, fmi3Discard, "After the events of this instant the equations have no finite solution.", "", "");
-  *states = NX > 0 && memcmp(s->d + AT_X, m->next + AT_X, NX * sizeof *s->d) != 0;
+  u->states = NX > 0 && memcmp(s->d + AT_X, m->next + AT_X, NX * sizeof *s->d) != 0;
   memcpy(s->d, m->next, sizeof s->d);
   s->last = s->d[AT_T];
-  *again = fired;
-  *terminate = run[ENDED_AT] > 0;
+  u->again = fired;
+  u->terminate = run[ENDED_AT] > 0;
   for (int k = 0; k < NC; ++k) {
     const double due = s->d[AT_CLOCKS + NC + k];
-    if (is_number(due) && (!*has_next || due < *next)) {
-      *has_next = true;
-      *next = due;
+    if (is_number(due) && (!u->has_next || due < u->next)) {
+      u->has_next = 1;
+      u->next = due;
     }
   }
   return fmi3OK;
 }
 
-/* --- what this FMU has not --------------------------------------------------------------------------------------- */
-
-static fmi3Status no_co_simulation(fmi3Instance i) {
-  return say(i, fmi3Error, "This FMU has Model Exchange only.", "", "");
+EXPORT fmi3Status fmi3CompletedIntegratorStep(
+    fmi3Instance i, fmi3Boolean final, fmi3Boolean *enter_event_mode, fmi3Boolean *terminate) {
+  Instance *m = i;
+  int wants = 0;
+  (void)final;
+  *enter_event_mode = *terminate = false;
+  if (m->s.mode != CONTINUOUS_TIME) return wrong_mode(m, "fmi3CompletedIntegratorStep");
+  const fmi3Status status = accepted(m, &wants);
+  *enter_event_mode = wants != 0;
+  return status;
 }
 
-static fmi3Status no_clocks(fmi3Instance i) { return say(i, fmi3Error, "This FMU has no clocks.", "", ""); }
+EXPORT fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance i) {
+  (void)i;
+  return fmi3OK;
+}
 
-EXPORT fmi3Status fmi3EnterStepMode(fmi3Instance i) { return no_co_simulation(i); }
+EXPORT fmi3Status fmi3UpdateDiscreteStates(
+    fmi3Instance i, fmi3Boolean *again, fmi3Boolean *terminate, fmi3Boolean *nominals, fmi3Boolean *states,
+    fmi3Boolean *has_next, fmi3Float64 *next) {
+  Instance *m = i;
+  Update u;
+  *again = *terminate = *nominals = *states = *has_next = false;
+  *next = 0;
+  if (m->s.mode != EVENT_MODE) return wrong_mode(m, "fmi3UpdateDiscreteStates");
+  const fmi3Status status = updated(m, &u);
+  *again = u.again != 0;
+  *terminate = u.terminate != 0;
+  *states = u.states != 0;
+  *has_next = u.has_next != 0;
+  *next = u.next;
+  return status;
+}
 
-EXPORT fmi3Status fmi3GetOutputDerivatives(
-    fmi3Instance i, const fmi3ValueReference r[], size_t n, const fmi3Int32 orders[], fmi3Float64 v[], size_t k) {
-  (void)r; (void)n; (void)orders; (void)v; (void)k;
-  return no_co_simulation(i);
+/* --- Co-Simulation ----------------------------------------------------------------------------------------------- */
+
+#if CO_SIMULATION
+
+/* How the next step follows from the error of the last one. */
+static const double SAFETY = 0.9, LEAST = 0.2, MOST = 5.0;
+
+static double weighted(const Instance *m, const double *v, const double *x, const double *y) {
+  double sum = 0;
+  for (int k = 0; k < NX; ++k) {
+    const double largest = fabs(x[k]) > fabs(y[k]) ? fabs(x[k]) : fabs(y[k]);
+    const double part = v[k] / (m->s.tolerance * (largest + ABSOLUTE * NOMINALS[k]));
+    sum += part * part;
+  }
+  return NX ? sqrt(sum / NX) : 0;
+}
+
+/* A first step (Hairer, Norsett and Wanner 1993, Solving Ordinary Differential Equations I, II.4). */
+static double first_step(Instance *m, double longest) {
+  const double *x = m->s.d + AT_X;
+  p_field_of(m->s.d, m->error, work_of(m));
+  const double size = weighted(m, x, x, x), slope = weighted(m, m->error, x, x);
+  const double h = size > 1e-5 && slope > 1e-5 ? 0.01 * size / slope : 1e-6 * longest;
+  return h < longest ? h : longest;
+}
+
+/* The state at a part of the step from `begin_x` to `end_x`. */
+static void inside(Instance *m, double t0, double h, double part) {
+  double *x = m->s.d + AT_X;
+  const double *k = m->dense;
+  m->s.d[AT_T] = t0 + part * h;
+  for (int j = 0; j < NX; ++j)
+    x[j] = part >= 1 ? m->end_x[j]
+                     : (1 - part) * m->begin_x[j]
+                           + part * (m->end_x[j] + (1 - part) * (k[j] + part * (k[NX + j] + part * k[2 * NX + j])));
+  m->valid = 0;
+}
+
+static void look(Instance *m, double *signs) {
+  p_guards_of(m->s.d, m->unknowns + NX + NY, work_of(m));
+  for (int k = 0; k < NG; ++k) signs[k] = indicator(m, k);
+}
+
+/* Whether an indicator has another sign than at the beginning of the step. */
+static int turned(Instance *m, double t0, double h, double part) {
+  inside(m, t0, h, part);
+  p_guards_of(m->s.d, m->unknowns + NX + NY, work_of(m));
+  for (int k = 0; k < NG; ++k)
+    if ((indicator(m, k) > 0) != (m->signs[k] > 0)) return 1;
+  return 0;
+}
+
+/* All events of this instant. */
+static fmi3Status happened(Instance *m, int *terminate) {
+  Update u;
+  fmi3Status status;
+  do {
+    status = updated(m, &u);
+    if (status != fmi3OK) return status;
+    *terminate |= u.terminate;
+  } while (u.again && !*terminate);
+  m->s.next_event = u.has_next ? u.next : INFINITY;
+  look(m, m->signs);
+  return fmi3OK;
+}
+
+static fmi3Status advance(Instance *m, double end, int *terminate) {
+  State *s = &m->s;
+  const double least = resolution(s);
+  fmi3Status status = happened(m, terminate); /* inputs may have jumped */
+  while (status == fmi3OK && !*terminate && s->d[AT_T] < end) {
+    const double t0 = s->d[AT_T], until = s->next_event < end ? s->next_event : end;
+    if (until - t0 <= least) { /* a tick at the end of this step, or at its beginning */
+      s->d[AT_T] = until;
+      if (s->next_event <= end) status = happened(m, terminate);
+      continue;
+    }
+    if (!(s->step > 0)) s->step = first_step(m, until - t0);
+    const int cut = s->step > SAFETY * (until - t0);
+    const double h = cut ? until - t0 : s->step;
+    memcpy(m->begin_x, s->d + AT_X, sizeof m->begin_x * (NX > 0));
+    p_step_of(s->d, h, m->end_x, m->error, m->dense, work_of(m));
+    const double norm = weighted(m, m->error, m->begin_x, m->end_x);
+    double factor = norm > 0 ? SAFETY * pow(norm, -1.0 / 5) : MOST;
+    factor = !(factor > LEAST) ? LEAST : factor > MOST ? MOST : factor; /* the least for what is not a number */
+    if (!(norm <= 1)) {
+      s->step = h * factor;
+      if (s->step <= least) {
+        int worst = 0;
+        for (int k = 1; k < NX; ++k)
+          if (!(fabs(m->error[k]) / NOMINALS[k] <= fabs(m->error[worst]) / NOMINALS[worst])) worst = k;
+        return say(m, fmi3Discard, "Steps have become too short, because of ", UNKNOWNS[worst], ".");
+      }
+      continue;
+    }
+    double begin = 0, part = 1;
+    int event = 0;
+    if (NG > 0)
+      for (int k = 1; k <= LOOKS && !event; ++k) {
+        part = (double)k / LOOKS;
+        event = turned(m, t0, h, part);
+        if (!event) begin = part;
+      }
+    if (event) { /* the first change of a sign, to the resolution of time */
+      while ((part - begin) * h > 0.25 * least) {
+        const double middle = 0.5 * (begin + part);
+        if (middle <= begin || middle >= part) break;
+        if (turned(m, t0, h, middle)) part = middle;
+        else begin = middle;
+      }
+    }
+    inside(m, t0, h, part);
+    if (part >= 1 && cut) s->d[AT_T] = until;
+    if (!cut || factor < 1) s->step = h * factor;
+    int wants = 0;
+    status = accepted(m, &wants);
+    if (status == fmi3OK && (event || wants || (s->next_event <= end && s->d[AT_T] >= s->next_event)))
+      status = happened(m, terminate);
+    else
+      look(m, m->signs);
+  }
+  m->valid = 0;
+  return status;
 }
 
 EXPORT fmi3Status fmi3DoStep(
     fmi3Instance i, fmi3Float64 t, fmi3Float64 h, fmi3Boolean final, fmi3Boolean *event, fmi3Boolean *terminate,
     fmi3Boolean *early, fmi3Float64 *last) {
+  Instance *m = i;
+  int ended = 0;
+  (void)final;
+  *event = *terminate = *early = false;
+  *last = m->s.d[AT_T];
+  if (m->s.mode != STEP_MODE) return wrong_mode(m, "fmi3DoStep");
+  if (!is_number(t) || !is_number(h) || !(h > 0)) return say(m, fmi3Error, "The step is not positive.", "", "");
+  if (fabs(t - m->s.d[AT_T]) > 1e-9 * (fabs(t) + h))
+    return say(m, fmi3Error, "The communication point is not where the last step ended.", "", "");
+  const fmi3Status status = advance(m, t + h, &ended);
+  *terminate = ended != 0;
+  *last = m->s.d[AT_T];
+  return status;
+}
+
+#else
+
+EXPORT fmi3Status fmi3DoStep(
+    fmi3Instance i, fmi3Float64 t, fmi3Float64 h, fmi3Boolean final, fmi3Boolean *event, fmi3Boolean *terminate,
+    fmi3Boolean *early, fmi3Float64 *last) {
   (void)t; (void)h; (void)final; (void)event; (void)terminate; (void)early; (void)last;
-  return no_co_simulation(i);
+  return say(i, fmi3Error, "This FMU has Model Exchange only.", "", "");
+}
+
+#endif
+
+/* --- what this FMU has not --------------------------------------------------------------------------------------- */
+
+static fmi3Status no_clocks(fmi3Instance i) { return say(i, fmi3Error, "This FMU has no clocks.", "", ""); }
+
+EXPORT fmi3Status fmi3EnterStepMode(fmi3Instance i) {
+  return say(i, fmi3Error, "This FMU handles its events itself in Co-Simulation.", "", "");
+}
+
+EXPORT fmi3Status fmi3GetOutputDerivatives(
+    fmi3Instance i, const fmi3ValueReference r[], size_t n, const fmi3Int32 orders[], fmi3Float64 v[], size_t k) {
+  (void)r; (void)orders; (void)v; (void)k;
+  return n ? say(i, fmi3Error, "This FMU has no derivatives of outputs by time.", "", "") : fmi3OK;
 }
 
 EXPORT fmi3Status fmi3ActivateModelPartition(fmi3Instance i, fmi3ValueReference r, fmi3Float64 t) {

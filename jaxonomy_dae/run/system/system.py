@@ -559,6 +559,7 @@ class AcausalSystem(eqx.Module):
         *,
         outputs: Sequence[str] | None = None,
         parameters: Sequence[str] | str = "all",
+        kinds: Sequence[str] | None = None,
         platforms: Sequence[str] | str | None = None,
         stop_time: float = 1.0,
         tolerance: float = 1e-6,
@@ -569,8 +570,8 @@ class AcausalSystem(eqx.Module):
         from ...fmi.export import export_fmu
 
         return export_fmu(
-            self, path, outputs=outputs, parameters=parameters, platforms=platforms, stop_time=stop_time,
-            tolerance=tolerance, overwrite=overwrite,
+            self, path, outputs=outputs, parameters=parameters, kinds=kinds, platforms=platforms,
+            stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
         )  # fmt: skip
 
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
