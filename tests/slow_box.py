@@ -105,6 +105,7 @@ class SlowBox:
         self.tests = 0
         self.begun = False
         self.ran: dict[str, bool] = {}  # whether it passed
+        self.took: dict[str, float] = {}  # seconds
 
     @pytest.hookimpl(trylast=True)  # after those that are not slow have been left out
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
@@ -127,6 +128,7 @@ class SlowBox:
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self.ran[report.nodeid] = self.ran.get(report.nodeid, True) and report.outcome != "failed"
+        self.took[report.nodeid] = self.took.get(report.nodeid, 0.0) + report.duration
 
     @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
     def pytest_configure_node(self, node: Any) -> None:
@@ -158,8 +160,13 @@ class SlowBox:
             pass  # the circle has turned at the next run
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        if not hasattr(session.config, "workerinput"):
-            self.remember()
+        if hasattr(session.config, "workerinput"):
+            return
+        self.remember()
+        if session.config.rootpath == DURATIONS.parents[1] and not os.environ.get("CI"):
+            new = {test: round(took, 2) for test, took in self.took.items() if test not in self.told["seconds"]}
+            if new:  # to be committed
+                DURATIONS.write_text(json.dumps(dict(sorted((self.told["seconds"] | new).items())), indent=4) + "\n")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

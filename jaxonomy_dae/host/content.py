@@ -40,6 +40,13 @@ _BESIDE = frozenset({
 })  # fmt: skip
 
 
+def _is_plain(member: object) -> bool:
+    """True for numbers, texts, members of enumerations, what has a name in a library, and tuples of such."""
+    if isinstance(member, tuple | frozenset):
+        return type(member) in (tuple, frozenset) and all(map(_is_plain, member))
+    return type(member) in _PLAIN or isinstance(member, enum.Enum) or (callable(member) and place(member) is not None)
+
+
 class HasContent(Protocol):
     """A part that says itself what it is, instead of being walked over."""
 
@@ -180,11 +187,13 @@ class _Walk:
         self.parts(items)
 
     def _set(self, part: Any, kind: type) -> None:
+        """Members have no order of their own, so that each is walked over by itself. One that leads back to the set
+        would never end: only plain data, and what is known by its name, count."""
         members = []
         for member in part:
-            found = content(member)
-            self.unseen += found.unseen
-            members.append(found.digest)
+            if not _is_plain(member):
+                return self.hidden(f"a set with an object of type {type(member).__qualname__}")
+            members.append(content(member).digest)
         self.say("set", kind.__name__, *sorted(members))
 
     def _tree(self, tree: Any) -> None:

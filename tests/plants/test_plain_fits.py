@@ -140,7 +140,7 @@ def test_a_fit_from_coarse_to_fine_finds_a_law_that_bends():
         np.testing.assert_array_less(np.abs(band.mean - hardening(band.grid)), 0.03 * 7)
 
 
-@pytest.mark.long("residuals with and without their Jacobian, two fits")
+@pytest.mark.slow
 def test_two_seeds_give_the_same_law_where_the_data_say_the_same():
     """What the data leave open was decided by the weights that the network was drawn with."""
     problem, laws = learning.Problem(system(), record(seed=3), train=["c.f"]), []

@@ -74,6 +74,7 @@ def test_initial_loss_and_gradient_are_the_tutorials(training):
     assert float(jnp.linalg.norm(gradient.neural["drag"])) == pytest.approx(INITIAL_GRADIENT_NORM, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", TRAINING)
 def test_training_trace_is_the_tutorials(training, step):
     losses, _ = training

@@ -106,7 +106,7 @@ def test_what_cannot_be_asked_is_refused():
         fit().predict("c.x", first=3)
 
 
-@pytest.mark.long("residuals and their Jacobian of two experiments")
+@pytest.mark.slow
 def test_cross_validation_leaves_each_out_once():
     """Each rate is that of a problem without the experiment; scores are those of new data."""
     found = learning.cross_validate(problem())
