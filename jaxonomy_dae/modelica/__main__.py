@@ -17,7 +17,7 @@ from ..run.system.acausal_compiler import AcausalCompiler
 from ..run.system.system import AcausalSystem
 from ..write.diagram import AcausalDiagram
 from ..write.environment import EqnEnv
-from .component import FlatComponent
+from .flat_component import FlatComponent
 from .flat_model import FlatModel
 from .load import load
 

@@ -11,14 +11,14 @@ from typing import Any
 
 from .builtin import FUNCTIONS
 from .flat_model import FlatModel
-from .library import Constant, Found, Library, Member
+from .sources import Constant, Found, Member, Sources
 from .tree import Call, Class, Comprehension, Declaration, Effect, Loop, Modifiers, Part, Reference, each_part
 
 _BUILT_IN = ("Real", "Integer", "Boolean", "String")
 _RECORDS = ("record", "class")
 
 
-def completed(flat: FlatModel, library: Library, known: frozenset[str]) -> FlatModel:
+def completed(flat: FlatModel, library: Sources, known: frozenset[str]) -> FlatModel:
     """The model with the definitions that its text lacks, as far as the library has them; `known` are the functions
     that need none."""
     classes = dict(flat.classes)
@@ -39,7 +39,7 @@ def completed(flat: FlatModel, library: Library, known: frozenset[str]) -> FlatM
     return dataclasses.replace(flat, classes=classes)
 
 
-def _of_a_part(name: str, flat: FlatModel, library: Library) -> Member | None:
+def _of_a_part(name: str, flat: FlatModel, library: Sources) -> Member | None:
     """What a name within a part of the model stands for, judged by the functions beside it."""
     parts = name.split(".")
     for k in range(len(parts) - 1, 1, -1):
@@ -60,7 +60,7 @@ def _of_a_part(name: str, flat: FlatModel, library: Library) -> Member | None:
     return next(iter(found.values())) if len(found) == 1 else None
 
 
-def _is_like(library: Library, package: Found, c: Class) -> bool:
+def _is_like(library: Sources, package: Found, c: Class) -> bool:
     """True if the function of this name in a package declares the same variables."""
     found = library.member(package, c.name.rpartition(".")[2])
     if not isinstance(found, Found):
@@ -72,7 +72,7 @@ def _is_like(library: Library, package: Found, c: Class) -> bool:
 class _Writer:
     """Writes classes of a library into `classes` as flat ones, those that they use included."""
 
-    def __init__(self, library: Library, classes: dict[str, Class]):
+    def __init__(self, library: Sources, classes: dict[str, Class]):
         self.library, self.classes = library, classes
 
     def write(self, found: Found, name: str | None = None) -> str:

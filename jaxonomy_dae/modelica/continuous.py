@@ -92,6 +92,8 @@ def _one_equation(scope: Scope, branches: list[tuple[Value, Sides]]) -> Sides:
 
 def pairs(a: Value, b: Value) -> list[Sides]:
     """The entries of two values, one beside the other."""
+    if isinstance(a, list) and isinstance(b, float) and b == 0:  # a residual, which is an array
+        return [pair for x in a for pair in pairs(x, b)]
     if isinstance(a, list) or isinstance(b, list):
         if not (isinstance(a, list) and isinstance(b, list)) or len(a) != len(b):
             raise ModelError(f"the sides of an equation differ in size: {a} and {b}")

@@ -1,232 +1,190 @@
-"""Classes of Modelica libraries, found by name as the Modelica Language Specification 3.6, chapter 5, says."""
+"""Modelica libraries, whose classes are classes of components."""
 
-import dataclasses
 import functools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any
 
-from ..base.errors import ModelError
-from .read_base import read_base
-from .tree import Class, Declaration, Modifiers
+from ..base.errors import ModelError, nearest
+from .front_end import FrontEnd
+from .modification import modification
+from .open_class import OpenClass, opened
+from .open_component import OpenComponent
+from .shelf import Shelf
+from .sources import Found, Sources
 
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Found:
-    """A class as it was reached.
-
-    - `path`: its full name, by the package through which it was inherited.
-    - `scopes`: where names that it uses are looked up after itself, innermost first.
-    - `changes`: the modifiers of the short definition through which it was reached.
-    """
-
-    source: Class
-    path: str
-    scopes: tuple["Found", ...]
-    changes: tuple[tuple[Modifiers, tuple["Found", ...]], ...] = ()
-
-    @property
-    def inside(self) -> tuple["Found", ...]:
-        """Where names that stand in it are looked up."""
-        return (self, *self.scopes)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Constant:
-    """A constant of a package, with where the names in its value are looked up."""
-
-    declaration: Declaration
-    scopes: tuple[Found, ...]
-
-
-Member: TypeAlias = Found | Constant
-
-
-def read_source(file: Path) -> Class:
-    """The class of a file.
-
-    **Raises:**
-
-    - `ModelError` for what is not Modelica, with file, line and column.
-    """
-    try:
-        found = read_base(file.read_text(encoding="utf-8-sig"))
-    except ModelError as error:
-        raise ModelError(f"{file}: {str(error).removeprefix('Base Modelica, ')}") from None
-    return found._replace(folder=file.parent) if file.name == "package.mo" else found
+_WRAPPER = "Opened"  # the model that extends a class with modifications
 
 
 class Library:
-    """Libraries in folders; `Modelica` of `roots=["lib"]` is `lib/Modelica/package.mo` or `lib/Modelica.mo`, and a root
-    may be the folder `lib/Modelica` itself."""
+    """Modelica libraries. `library["Modelica.Electrical.Analog.Semiconductors.NPN"]` is a class of components.
 
-    def __init__(self, roots: Sequence[str | Path]):
-        self.roots = [Path(root) for root in roots]
-        self.outermost: dict[str, Found | None] = {}
-        self.busy: set[tuple[int, str]] = set()
-        self.holders: dict[str, list[Found]] = {}
+    ```python
+    library = modelica.Library(["libraries"])  # the folder that holds the folder Modelica
+    NPN = library["Modelica.Electrical.Analog.Semiconductors.NPN"]
+    q = NPN(ev, "q", Bf=80.0)
+    diagram.connect(q.C, resistor.p)
+    ```
 
-    def find(self, name: str) -> Member | None:
-        """What a full name stands for; None if no root holds it."""
-        first, *rest = name.split(".")
-        if first not in self.outermost:
-            self.outermost[first] = self._file_of(first)
-        return self._inner(self.outermost[first], rest)
+    **Arguments:**
 
-    def lookup(self, name: str, scopes: Sequence[Found]) -> tuple[Member, list[str]] | None:
-        """(What the longest beginning of a name that is a class or constant stands for, the parts behind it)."""
-        first, *rest = name.split(".")
-        for scope in scopes:
-            found = self.member(scope, first) or self._imported(scope, first)
-            if found is not None:
-                break
-        else:
-            found = self.find(first)
-        if found is None:
-            return None
-        while rest and isinstance(found, Found):
-            inner = self.member(found, rest[0])
-            if inner is None:
-                return (found, rest) if found.source.literals else None
-            found, rest = inner, rest[1:]
-        return found, rest
+    - `roots`: folders or files of Modelica sources, and files that `python -m jaxonomy_dae.modelica pack` has written.
+        Sources are flattened by rumoca (extra `modelica`) when a class is asked for; files of `pack` need no front end.
 
-    def class_of(self, name: str, scopes: Sequence[Found]) -> Found | None:
-        found = self.lookup(name, scopes)
-        return found[0] if found and isinstance(found[0], Found) and not found[1] else None
+    A class that was flattened is kept as data in the user's cache directory (`keep_programs` chooses another), by its
+    name, its modifications, the contents of the roots and the version of rumoca.
+    """
 
-    def member(self, of: Found, name: str) -> Member | None:
-        """A class or constant of a package, inherited ones among them."""
-        key = id(of.source), name
-        if key in self.busy:  # a base that is looked up in what it is a base of
-            return None
-        self.busy.add(key)
-        try:
-            return self._own(of, name) or self._inherited(of, name)
-        finally:
-            self.busy.discard(key)
-
-    def _own(self, of: Found, name: str) -> Member | None:
-        source = of.source
-        if name not in source.classes and source.folder is not None:
-            for file in (source.folder / f"{name}.mo", source.folder / name / "package.mo"):
-                if file.exists():
-                    source.classes[name] = read_source(file)
-        if name in source.classes:
-            return self._followed(Found(source.classes[name], f"{of.path}.{name}", of.inside))
-        for d in source.declarations:
-            if d.name == name:
-                return Constant(d, of.inside)
-        return None
-
-    def _followed(self, found: Found) -> Found:
-        """What a short definition stands for; enumerations and types stand for themselves."""
-        alias = found.source.alias
-        if alias is None or found.source.kind == "type":
-            return found
-        target = self.class_of(alias.type, found.scopes)
-        if target is None:
-            return found
-        return dataclasses.replace(target, changes=((alias.modifiers, found.scopes), *target.changes))
-
-    def _inherited(self, of: Found, name: str) -> Member | None:
-        for base, modifiers in of.source.bases:
-            target = self.class_of(base, of.scopes)
-            found = self._changed(of, target, name, [(modifiers, of.inside)]) if target else None
-            if found is not None:
-                return found
-        return self._changed(of, None, name, of.changes)
-
-    def _changed(self, of: Found, base: Found | None, name: str, changes: Sequence) -> Member | None:
-        """A member of a base, as modifiers change it."""
-        found = self._within(of, base, name) if base else None
-        for modifiers, scopes in changes:
-            change = modifiers.get(name)
-            if isinstance(change, Declaration):
-                return self.class_of(change.type, scopes) or found
-            if isinstance(found, Constant) and change is not None:
-                d = found.declaration
-                if isinstance(change, dict):
-                    return Constant(d._replace(modifiers={**d.modifiers, **change}), scopes)
-                return Constant(d._replace(value=change), scopes)
-        return found
-
-    def _within(self, of: Found, base: Found, name: str) -> Member | None:
-        """A member of a base: it finds names in the package that inherits it first."""
-        found = self.member(base, name)
-        if isinstance(found, Constant):
-            return Constant(found.declaration, (of, *found.scopes, *of.scopes))
-        if found is None or found.path != f"{base.path}.{name}":
-            return found
-        return Found(found.source, f"{of.path}.{name}", (of, *found.scopes, *of.scopes), found.changes)
-
-    def inherited_class(self, found: Found) -> Found | None:
-        """What `redeclare function extends f` continues: f as the bases of its package have it."""
-        name, reached = found.source.name, found.scopes[0]
-        holder = next((s for s in found.scopes if s.source.classes.get(name) is found.source), reached)
-        for base, _ in holder.source.bases:
-            target = self.class_of(base, holder.scopes)
-            inner = self._within(reached, target, name) if target else None
-            if isinstance(inner, Found):
-                return inner
-        return None
-
-    def _imported(self, scope: Found, name: str) -> Member | None:
-        for local, full in scope.source.imports:
-            if local == name:
-                return self.find(full)
-            if local == "*":
-                package = self.find(full)
-                found = self.member(package, name) if isinstance(package, Found) else None
-                if found is not None:
-                    return found
-        return None
-
-    def _inner(self, found: Member | None, names: Sequence[str]) -> Member | None:
-        for name in names:
-            if not isinstance(found, Found):
-                return None
-            found = self.member(found, name)
-        return found
-
-    # --- files -------------------------------------------------------------------------------------------------------
-
-    def _file_of(self, name: str) -> Found | None:
-        for root in self.roots:
-            places = [root / name / "package.mo", root / f"{name}.mo"]
-            places += [root / "package.mo"] if root.name.split(" ")[0] == name else []
-            for file in places:
-                if file.exists():
-                    return Found(read_source(file), name, ())
-        return None
-
-    def packages_with(self, name: str) -> list[Found]:
-        """All packages that define a function of this name themselves."""
-        if name not in self.holders:
-            self.holders[name] = list(self._packages_with(name))
-        return self.holders[name]
-
-    def _packages_with(self, name: str) -> Iterator[Found]:
-        sought = re.compile(rf"\bfunction\s+(extends\s+)?{re.escape(name)}\b")
-        for root, file in self._files:
-            if sought.search(file.read_text(encoding="utf-8", errors="replace")):
-                parts = file.relative_to(root).with_suffix("").parts
-                found = self.find(".".join(p for p in parts if p != "package"))
-                if isinstance(found, Found):
-                    yield from _packages_with(self, found, name)
+    def __init__(self, roots: str | Path | Sequence[str | Path]):
+        each = [roots] if isinstance(roots, str | Path) else list(roots)
+        missing = [str(root) for root in each if not Path(root).exists()]
+        if missing:
+            raise ModelError(f"roots: there is no '{missing[0]}'")
+        self.shelf = Shelf([Path(root) for root in each])
+        self.sources = [Path(root) for root in each if Path(root).suffix != ".zip"]
+        self._classes: dict[tuple[str, str, str], type[OpenComponent]] = {}
 
     @functools.cached_property
-    def _files(self) -> list[tuple[Path, Path]]:
-        """Pairs (folder that holds the outermost package, file)."""
-        tops = [(r.parent if (r / "package.mo").exists() else r, r) for r in self.roots]
-        return [(top, file) for top, root in tops for file in sorted(root.rglob("*.mo"))]
+    def front_end(self) -> FrontEnd:
+        """rumoca with the sources of the library, which it reads once."""
+        return FrontEnd(self.sources)
+
+    @functools.cached_property
+    def _names(self) -> Sources:
+        return Sources(self.sources)
+
+    def __getitem__(self, name: str) -> type[OpenComponent]:
+        return self.component(name)
+
+    def component(self, name: str, *texts: str, source: str | None = None, **modifications: Any) -> type[OpenComponent]:
+        """A class of the library as a class of components; the arguments are those of `component`."""
+        changes = modification(texts, modifications)
+        key = name, changes, source or ""
+        if key not in self._classes:
+            found = self.opened(name, changes, source)
+            _check_modified(found, modifications)
+            self._classes[key] = component_of(found)
+        return self._classes[key]
+
+    def opened(self, name: str, changes: str = "", source: str | None = None) -> OpenClass:
+        """What is known of a class with modifications, given as text."""
+        found = self.shelf.find(name, changes, source or "")
+        if found is None:
+            found = self._flattened(name, changes, source)
+            self.shelf.keep(found, name, changes, source or "")
+        return found
+
+    def _flattened(self, name: str, changes: str, source: str | None) -> OpenClass:
+        if not self.sources and source is None:
+            packed = self.shelf.names()
+            if name in packed:
+                raise ModelError(
+                    f"'{name}' is packed without the modifications '{changes}': roots=[…] with the sources of the "
+                    "library opens it with them"
+                )
+            raise ModelError(f"there is no class '{name}' in {self.shelf}: {nearest(name, packed)}")
+        if source is None:
+            self._check_known(name)
+        if not changes:
+            return opened(name, self.front_end.flatten(source, name))
+        text = f"{source or ''}\nmodel {_WRAPPER} extends {name}({changes}); end {_WRAPPER};\n"
+        return opened(name, self.front_end.flatten(text, _WRAPPER))
+
+    def _check_known(self, name: str) -> None:
+        """Names what is near a class that no root holds, before the front end reads the whole library."""
+        sources = self._names
+        try:
+            if isinstance(sources.find(name), Found):
+                return
+        except ModelError:  # a file that only the front end reads
+            return
+        package, _, last = name.rpartition(".")
+        while package:
+            found = sources.find(package)
+            if isinstance(found, Found):
+                raise ModelError(f"'{package}' has no class '{last}': {nearest(last, sources.names_in(found))}")
+            package, _, last = package.rpartition(".")
+        where = ", ".join(map(str, self.sources))
+        raise ModelError(f"'{name}' is in none of the roots: {where}; roots=[…] names the folder that holds '{last}'")
 
 
-def _packages_with(library: Library, found: Found, name: str) -> Iterator[Found]:
-    if name in found.source.classes:
-        yield found
-    for inner in list(found.source.classes):
-        member = library.member(found, inner)
-        if isinstance(member, Found) and member.source.kind == "package" and member.path == f"{found.path}.{inner}":
-            yield from _packages_with(library, member, name)
+def _check_modified(of: OpenClass, modifications: Mapping[str, Any], outer: str = "") -> None:
+    """Refuses modifications of what the class does not have: rumoca passes over them."""
+    names = [d.name for d in of.flat.model.declarations]
+    for name, value in modifications.items():
+        full = outer + name
+        if isinstance(value, Mapping):
+            _check_modified(of, value, f"{full}.")
+        elif not any(re.match(rf"{re.escape(full)}($|[.\[])", re.sub(r"\[[^]]*\]\.", ".", n)) for n in names):
+            raise ModelError(f"'{of.name}' has no '{full}' to modify: {nearest(full, names)}")
+
+
+def component_of(of: OpenClass) -> type[OpenComponent]:
+    """The class of components of an opened class."""
+    last = of.name.rpartition(".")[2]
+    return type(last, (OpenComponent,), {"opened": of, "__doc__": _described(of), "__module__": __name__})
+
+
+def _described(of: OpenClass) -> str:
+    lines = [of.description or of.name, "", f"The Modelica class `{of.name}`."]
+    for title, names in (
+        ("Ports", [p.name for p in of.ports]),
+        ("Inputs", of.inputs),
+        ("Outputs", of.outputs),
+        ("Required parameters", of.required),
+        ("Parameters", [n for n in of.tunable if n not in of.required]),
+    ):
+        if names:
+            lines += ["", f"{title}: {', '.join(f'`{n}`' for n in names)}."]
+    return "\n".join(lines)
+
+
+def component(
+    name: str,
+    *texts: str,
+    roots: str | Path | Sequence[str | Path] = (),
+    source: str | None = None,
+    **modifications: Any,
+) -> type[OpenComponent]:
+    """A Modelica class as a class of components, with ports, signals and parameters.
+
+    ```python
+    NPN = modelica.component(
+        "Modelica.Electrical.Analog.Semiconductors.NPN",
+        roots=["libraries"],
+        useHeatPort=True,
+    )
+    q = NPN(ev, "q", Bf=80.0)
+    diagram.connect(q.C, resistor.p)
+    diagram.connect(q.heatPort, sink.port)
+    ```
+
+    Connectors are ports: `Electrical`, `Rotational`, `Translational`, `Thermal` and `Hydraulic` where the quantities
+    are those of this package, and ports of a domain of their own otherwise. Of a connector of connectors, each
+    innermost one is a port: `r.plug_p[0]` is an `Electrical` port. Inputs and outputs are signals; Boolean inputs are
+    true above 1/2.
+
+    **Arguments:**
+
+    - `name`: the full name of a model or block, in the roots or in `source`.
+    - `texts`: modifications as Modelica text, such as `"redeclare package Medium = Water"`.
+    - `roots`: as those of `Library`.
+    - `source`: Modelica text, such as a part of a system that is connected inside and has plain connectors outside.
+    - `modifications`: values of parameters by name. They may decide the structure (conditional connectors, sizes,
+        enumerations, given by the text of their name). Values of Real parameters may be given later, too.
+
+    **Raises:**
+
+    - `ModelError` for a class that is not found, is partial or not balanced, for constructs that are not read, and for
+        connectors with stream variables or in overdetermined graphs.
+    - `MissingPackage` if rumoca is needed and not installed.
+    """
+    return _library(tuple(map(str, [roots] if isinstance(roots, str | Path) else roots))).component(
+        name, *texts, source=source, **modifications
+    )
+
+
+@functools.lru_cache(maxsize=1)  # a session of rumoca with the Modelica library takes 1.3 GB
+def _library(roots: tuple[str, ...]) -> Library:
+    return Library(roots)

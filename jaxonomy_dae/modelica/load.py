@@ -4,24 +4,19 @@ import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from ..base.errors import ModelError, nearest
-from ..base.optional import optional_module
 from .complete import completed
+from .external_objects import with_external_objects
 from .flat_model import FlatModel, flat_of
+from .front_end import FrontEnd
 from .left_out import LEFT_OUT
-from .library import Library
 from .read_base import read_base, read_modifiers
 from .read_rumoca import read_rumoca
 from .roots import ROOT
+from .sources import Sources
 from .tree import Modifiers
 
-_PLACE = re.compile(r"× (?P<what>[^\n]*)\s+╭─\[[^\]]*?:(?P<line>\d+):(?P<column>\d+)\]")
-_UNRESOLVED = re.compile(r"unresolved (type reference|function call|component reference|[\w ]+): '([^']+)'")
-_UNBALANCED = re.compile(r"unbalanced model: (\d+) equations, (\d+) unknowns")
 DEFINED = frozenset({*LEFT_OUT, ROOT})  # functions that texts need not hold
-_CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")
 
 
 def load(source: str | Path, model: str | None = None, roots: Sequence[str | Path] = ()) -> FlatModel:
@@ -49,49 +44,16 @@ def load(source: str | Path, model: str | None = None, roots: Sequence[str | Pat
     is_modelica = not is_text and str(source).endswith(".mo") and not is_base
     if model is None and (is_base or not roots) and not is_modelica:
         flat = flat_of(read_base(text))
-        return completed(flat, Library(roots), DEFINED) if roots else flat
+        return completed(flat, Sources(roots), DEFINED) if roots else flat
     return _by_rumoca(text, None if is_text else Path(source), model, roots)
 
 
 def _by_rumoca(text: str, file: Path | None, model: str | None, roots: Sequence[str | Path]) -> FlatModel:
-    rumoca = optional_module("rumoca", "modelica", "Modelica source is flattened by rumoca")
-    try:
-        session = rumoca.Session(roots=[str(root) for root in roots])
-        found = session.loads(text, model=model) if file is None else session.load(str(file), model=model)
-        dae = found.to_dict("dae")
-    except (rumoca.RumocaError, RuntimeError) as error:
-        raise ModelError(_said(rumoca, text, model, roots, str(error))) from None
+    found = FrontEnd(roots).flatten(text, model, file)
     name = found.name.rpartition(".")[2]
-    flat = read_rumoca(dae, name)
+    flat = with_external_objects(read_rumoca(found.dae, name), found.flat)
     annotation = _annotation(text, name)
     return dataclasses.replace(flat, model=flat.model._replace(annotation=annotation))
-
-
-def _said(rumoca: Any, text: str, model: str | None, roots: Sequence[str | Path], error: str) -> str:
-    """What rumoca found wrong, with its place."""
-    found = [d.message for d in rumoca.validate_source(text, model=model) if d.rule == "syntax-error"]
-    if place := _PLACE.search("\n".join(found)):
-        return f"Modelica, line {place['line']}, column {place['column']}: {place['what'].strip()}"
-    unresolved = sorted((m.groups() for m in _UNRESOLVED.finditer(error)), key=lambda each: each[0] != "type reference")
-    if unresolved:
-        kind, name = unresolved[0]
-        at = re.search(rf"(?<![\w.]){re.escape(name)}(?!\w)", text)
-        line = f", line {text.count(chr(10), 0, at.start()) + 1}" if at else ""
-        more = "" if roots else "; roots=[…] names the folders of the libraries that the source uses"
-        return f"Modelica{line}: the {kind} '{name}' is not found{more if '.' in name else ''}"
-    known = _CLASS.findall(text)
-    last = (model or "").rpartition(".")[2]
-    if last and last not in known and not roots:
-        return f"there is no model '{model}': {nearest(last, known)}"
-    if counts := _UNBALANCED.search(error):
-        equations, unknowns = map(int, counts.groups())
-        few = "; rumoca does not say which of them are too many"
-        return f"'{model or last}' has {_count(equations, 'equation')} for {_count(unknowns, 'unknown')}{few}"
-    return f"rumoca {rumoca.version()}: {error}"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _annotation(text: str, name: str) -> Modifiers:

@@ -6,7 +6,8 @@ events. Here it becomes the record that `read_base` makes of a text.
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, TypeAlias
 
 from ..base.errors import ModelError
@@ -33,6 +34,23 @@ def read_rumoca(dae: Json, name: str = "model") -> FlatModel:
     - `ModelError` for a schema other than the one that was tried, with the version to install; for a construct that is
         not read, by its name and line.
     """
+    _check_schema(dae)
+    return _Reader(RumocaExpressions(dae, name)).model()
+
+
+def read_open(dae: Json, name: str, flows: Collection[str]) -> FlatModel:
+    """As `read_rumoca`, without the equations `flow = 0` of the given flows of connectors, and with parameters that
+    have no value.
+
+    **Raises:**
+
+    - `ModelError` as `read_rumoca`; and if one of the flows has no such equation.
+    """
+    _check_schema(dae)
+    return _Reader(RumocaExpressions(dae, name), frozenset(flows)).model()
+
+
+def _check_schema(dae: Json) -> None:
     schema = dae.get("schema_version")
     if schema != SCHEMA or "storage" not in dae:
         found = f"this is schema {schema}" if schema is not None else "this dictionary names no schema"
@@ -40,18 +58,39 @@ def read_rumoca(dae: Json, name: str = "model") -> FlatModel:
             f'read_rumoca reads schema {SCHEMA} of to_dict("dae"), as rumoca {VERSION} writes it; {found}. '
             f'pip install "rumoca=={VERSION}"'
         )
-    return _Reader(RumocaExpressions(dae, name)).model()
 
 
 class _Reader:
-    def __init__(self, of: RumocaExpressions):
+    def __init__(self, of: RumocaExpressions, flows: frozenset[str] | None = None):
         self.of = of
+        self.flows = flows  # of open connectors; None for a model that is complete
+
+    def _continuous(self) -> list[Json]:
+        """The continuous equations, without those that close open connectors: one for each of their flows."""
+        ops = self.of.storage["continuous_equation_operations"]
+        if not self.flows:
+            return ops
+        closed = [self._set_to_zero(op) for op in ops]
+        owner = {flow: flow if flow in closed else re.sub(r"\[[\d,]*\]$", "", flow) for flow in sorted(self.flows)}
+        for flow, name in owner.items():
+            if closed.count(name) != 1:
+                count = f"{closed.count(name)} equations of the flattening close '{flow}'"
+                raise ModelError(f"{self.of.name}: {count}; 1 was expected")
+        return [op for op, name in zip(ops, closed, strict=True) if name not in set(owner.values())]
+
+    def _set_to_zero(self, op: Json) -> str:
+        """The flow that an equation of a connection sets to zero; the empty text for all others."""
+        inside = op.get("residual", {})
+        if (inside.get("provenance") or {}).get("origin") != {"generated": "flow_balance_equation"}:
+            return ""
+        e = self.of.expression(inside["residual"], {})
+        return e.path if isinstance(e, tree.Reference) and not any(e.subscripts) else ""
 
     def model(self) -> FlatModel:
         s = self.of.storage
         for each in (*s["previous_values"], *(c for c in s["clock_ownerships"] if c.get("sampled"))):
             self.of.refuse("a synchronous clock", each.get("provenance"))
-        equations = [e for op in s["continuous_equation_operations"] for e in self._equations(op)]
+        equations = [e for op in self._continuous() for e in self._equations(op)]
         equations += [e for activation, _, _, e in self._of_discrete() if activation == "always"]
         equations += self._whens()
         initial = [e for op in s["initialization_equation_operations"] for e in self._equations(op)]
@@ -85,7 +124,8 @@ class _Reader:
                 if at.get(key) is not None and not (key == "start" and self._is_default(at[key], v)):
                     modifiers[key] = self._entry(at[key], place)
             value = self._entry(at["binding"], place) if at.get("binding") is not None else None
-            if constant and value is None and "start" not in modifiers and modifiers.get("fixed") != tree.Truth(False):
+            is_bound = value is not None or "start" in modifiers or modifiers.get("fixed") == tree.Truth(False)
+            if constant and not is_bound and self.flows is None:
                 raise ModelError(f"{self.of.name}: the parameter '{v['name']}' has no value")
             name = tree.entry_name(v["name"], place) if place else v["name"]
             line = self.of.line(v.get("declaration"))

@@ -8,14 +8,15 @@ event are discrete variables; the others are expressions, put in wherever they a
 import contextlib
 import functools
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import TypeVar
 
 import sympy
 
 from ..base.errors import ModelError
 from ..write.component import Component
-from ..write.symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, der
+from ..write.events import terminate
+from ..write.symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, der
 from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter
@@ -23,7 +24,7 @@ from .kept_relations import KeptRelations
 from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
-from .tables import CONSTANT, EXTERNALS, LINEAR, SMOOTHNESS
+from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
 from .tree import Assignment, Branches, Declaration, Equality, Expression, Reference, Truth, entry_name
 from .values import Record, Value, as_number, both, is_condition, negated, plain
 
@@ -36,6 +37,8 @@ class Scope:
     """The names of a flat model that is being written into a component.
 
     - `numbers`: parameters whose values are numbers.
+    - `given`: values of parameters in place of those of the text: numbers, or expressions in parameters.
+    - `signals`: Boolean and Integer inputs that are real inputs of the component: true above 1/2, or rounded.
     - `interpreter`: evaluates expressions in these names.
     - `definitions`: which statement determines which variable.
     - `kept`: relations whose truth is kept between events.
@@ -48,8 +51,12 @@ class Scope:
       condition is false.
     """
 
-    def __init__(self, flat: FlatModel, component: Component, numbers: Collection[str] = ()):
+    def __init__(
+        self, flat: FlatModel, component: Component, numbers: Collection[str] = (),
+        given: Mapping[str, Value] | None = None, signals: Collection[str] = (),
+    ):  # fmt: skip
         self.flat, self.component, self.numbers = flat, component, numbers
+        self.given, self.signals = given or {}, signals
         self.kept = KeptRelations(component)
         self.declared = {d.name: d for d in flat.model.declarations}
         self.known: dict[str, Value] = {"time": component.ev.t}
@@ -63,11 +70,14 @@ class Scope:
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
         self.random = RandomNumbers(component)
         self.interpreter = Interpreter(
-            flat.classes, self.value, special, LEFT_OUT | EXTERNALS | self.random.functions() | {ROOT: self._root},
+            flat.classes, self.value, special,
+            LEFT_OUT | EXTERNALS | self.random.functions() | {ROOT: self._root}
+            | {name: functools.partial(self._read_table, EXTERNALS[name]) for name in GET_VALUE},
             self.entries, self._named,
         )  # fmt: skip
         self.definitions = find_definitions(flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
+        self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.in_action = self.as_numbers = False
         self.final: dict[str, Value] = {}
         self.initial: DiscreteSymbol | None = None
@@ -159,6 +169,8 @@ class Scope:
 
     def _constant(self, d: Declaration) -> Value:
         """The value of a parameter: a symbol for a Real, which is then a parameter of the component."""
+        if d.name in self.given:
+            return self._as_parameter(d, self.given[d.name])
         if d.value is None or self._is_unknown(d):
             found = self._initial_algorithm(d.name)
             if isinstance(found, int | float | bool):
@@ -197,7 +209,7 @@ class Scope:
                 return value
         elif not isinstance(value, sympy.Expr):
             return value
-        elif any(not isinstance(s, ParameterSymbol) or isinstance(s, DiscreteSymbol) for s in value.free_symbols):
+        elif not _is_of_parameters(value):
             return value
         return self.component.parameter(d.name, value, unit=self._unit(d))
 
@@ -208,6 +220,10 @@ class Scope:
     def _expression_of(self, d: Declaration) -> Value:
         """What a Boolean or Integer variable is, in terms of what it depends on."""
         found = self.definitions.of.get(d.name)
+        if d.name in self.signals:
+            is_declared = d.name in self.component.variables
+            signal = VariableSymbol(d.name) if is_declared else self.component.input(d.name)
+            return sympy.Gt(signal, 0.5) if self.kind(d.type) == "Boolean" else sympy.floor(signal + 0.5)
         if found is None:  # an input of the model that nothing drives
             start = self._start(d.modifiers.get("start")) or self._least(d.type)
             return bool(start) if self.kind(d.type) == "Boolean" else int(start)
@@ -246,7 +262,7 @@ class Scope:
         """A parameter that initial equations determine: a variable that does not change. If one of them just says
         what it is, it is a parameter."""
         value = self._said_initially(d.name)
-        if isinstance(value, int | float):
+        if isinstance(value, int | float) or isinstance(value, sympy.Expr) and _is_of_parameters(value):
             return self._as_parameter(d, value)
         start = d.modifiers.get("start") if d.value is None else d.value
         symbol = self.component.variable(d.name, start=self._start(start), unit=self._unit(d))
@@ -324,7 +340,7 @@ class Scope:
         if any(isinstance(s, known_before) for s in symbols):  # a variable would have the value of another side
             return e
         name = f":value[{len(self.names)}]"
-        if all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols):
+        if _is_of_parameters(e):
             self.names[e] = self.component.parameter(name, e)
         else:
             self.names[e] = self.component.variable(name)
@@ -342,6 +358,17 @@ class Scope:
             return EXTERNALS[name](*map(self.evaluate, arguments))
         finally:
             self.as_numbers = False
+
+    def _read_table(self, read: Callable[..., Value], table: Table, column: int, u: Value, *more: Value) -> Value:
+        """The value of a table. One without extrapolation ends the run where it is read outside of its rows."""
+        outside = table.outside(u) if isinstance(u, sympy.Expr) and not self.in_action else False
+        outside = functools.reduce(both, self.interpreter.guards, outside)
+        if not isinstance(outside, bool) and outside not in self.ends and outside.atoms(VariableSymbol, TimeSymbol):
+            self.ends.add(outside)
+            first, last = table.rows[0, 0] + table.shift, table.rows[-1, 0] + table.shift
+            told = f"a table is read outside of [{first:g}, {last:g}], without extrapolation"
+            self.component.when(self.kept.in_events(outside), terminate(told), at_start=True)
+        return read(table, column, u, *more)
 
     def _pre(self, e: Expression) -> Value:
         value = self.evaluate(e)
@@ -366,6 +393,10 @@ class Scope:
 
     def _sample(self, start: Expression, interval: Expression) -> Value:
         return self.component.sampled(self.evaluate(interval), self.evaluate(start))
+
+
+def _is_of_parameters(value: sympy.Expr) -> bool:
+    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in value.free_symbols)
 
 
 T = TypeVar("T")

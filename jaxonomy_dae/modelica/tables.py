@@ -13,7 +13,8 @@ import sympy
 
 from ..base.errors import ModelError
 from ..write.automatic_events import smooth
-from .values import Value, chosen
+from .operations import RELATIONS
+from .values import Value, chosen, either
 
 # The literals of Modelica.Blocks.Types.Smoothness and Extrapolation.
 LINEAR, AKIMA, CONSTANT, FRITSCH_BUTLAND, STEFFEN, MODIFIED_AKIMA = 1, 2, 3, 4, 5, 6
@@ -32,6 +33,13 @@ class Table:
     extrapolation: int
     start: float = -np.inf
     shift: float = 0.0
+
+    def outside(self, u: sympy.Expr) -> Value:
+        """The condition under which the table has no value at `u`; False if it has one everywhere."""
+        if self.extrapolation != NONE:
+            return False
+        first, last = (_plain(x + self.shift) for x in (self.rows[0, 0], self.rows[-1, 0]))
+        return either(RELATIONS["<"](u, first), RELATIONS[">"](u, last))
 
     def value(self, column: int, u: Value, events: bool) -> Value:
         """The value at `u` of the given one of the columns, counted from 1."""
@@ -56,6 +64,8 @@ class Table:
         if isinstance(u, int | float):
             k = max(int(np.searchsorted(x, u, side="right")) - 1, 0)
             k, beyond = min(k, len(pieces) - 1), not x[0] <= u < x[-1]
+            if self.extrapolation == NONE and not x[0] <= u <= x[-1]:
+                raise ModelError(f"the table is read at {u:g}, outside of [{x[0]:g}, {x[-1]:g}], without extrapolation")
             return float(self._ends(pieces, x, y, u)[0 if u < x[0] else 1]) if beyond else float(pieces[k](u))
         low, high = self._ends(pieces, x, y, u)
         branches = [(low, u < _plain(x[0]))]
@@ -84,8 +94,24 @@ class Table:
             method = "akima" if self.smoothness == AKIMA else "makima"
             found = scipy.interpolate.Akima1DInterpolator(x, y, method=method)
         else:
-            found = scipy.interpolate.PchipInterpolator(x, y)
+            slopes = _monotone_slopes(x, y, self.smoothness)
+            found = scipy.interpolate.CubicHermiteSpline(x, y, slopes)
         return [_polynomial(tuple(map(float, c)), float(a)) for c, a in zip(found.c.T, x, strict=False)]
+
+
+def _monotone_slopes(x: np.ndarray, y: np.ndarray, smoothness: int) -> np.ndarray:
+    """Derivatives at the points of a monotone cubic: those of Fritsch and Butland (1984) or of Steffen (1990) inside,
+    and at both ends the slope of the chord, as Modelica's tables take it."""
+    h, y = np.diff(x), y.astype(float)
+    s = np.diff(y) / h
+    before, after, h0, h1 = s[:-1], s[1:], h[:-1], h[1:]
+    with np.errstate(divide="ignore", invalid="ignore"):  # where a slope is zero, the derivative is
+        if smoothness == FRITSCH_BUTLAND:
+            inner = 3 * (h0 + h1) / ((h0 + 2 * h1) / before + (2 * h0 + h1) / after)
+        else:
+            mean = (before * h1 + after * h0) / (h0 + h1)
+            inner = np.sign(mean) * np.minimum(np.abs(mean), 2 * np.minimum(np.abs(before), np.abs(after)))
+    return np.concatenate([s[:1], np.where(before * after > 0, inner, 0.0), s[-1:]])
 
 
 def _plain(value: Value) -> Value:
@@ -139,6 +165,21 @@ SMOOTHNESS = {  # of tables: the place of this argument, counted from 0
     "Modelica.Blocks.Types.ExternalCombiTable1D": 4,
     "Modelica.Blocks.Types.ExternalCombiTimeTable": 5,
 }
+_OF_1D, _OF_TIME = ("ModelicaStandardTables_CombiTable1D_", "ModelicaStandardTables_CombiTimeTable_")
+# The functions of the Modelica library that call those in C; for a value, three that differ in their derivatives.
+_CALLERS = {
+    "getTable1DValue": f"{_OF_1D}getValue",
+    "getTable1DValueNoDer": f"{_OF_1D}getValue",
+    "getTable1DValueNoDer2": f"{_OF_1D}getValue",
+    "getTable1DAbscissaUmin": f"{_OF_1D}minimumAbscissa",
+    "getTable1DAbscissaUmax": f"{_OF_1D}maximumAbscissa",
+    "getTimeTableValue": f"{_OF_TIME}getValue",
+    "getTimeTableValueNoDer": f"{_OF_TIME}getValue",
+    "getTimeTableValueNoDer2": f"{_OF_TIME}getValue",
+    "getTimeTableTmin": f"{_OF_TIME}minimumTime",
+    "getTimeTableTmax": f"{_OF_TIME}maximumTime",
+    "getNextTimeEvent": f"{_OF_TIME}nextTimeEvent",
+}
 EXTERNALS: dict[str, Callable[..., Value]] = {
     "Modelica.Blocks.Types.ExternalCombiTable1D": table_1d,
     "Modelica.Blocks.Types.ExternalCombiTimeTable": time_table,
@@ -152,3 +193,5 @@ EXTERNALS: dict[str, Callable[..., Value]] = {
     "ModelicaInternal_print": lambda *_: None,
     "ModelicaStreams_closeFile": lambda *_: None,
 }
+EXTERNALS |= {caller: EXTERNALS[called] for caller, called in _CALLERS.items()}
+GET_VALUE = [name for name in EXTERNALS if _CALLERS.get(name, name).endswith("_getValue")]

@@ -38,7 +38,10 @@ def resolve_ends(ends: Sequence[Any], where: str) -> tuple[Connection | None, li
             if name not in inner.ports and name not in inner.variables:
                 what, known = ("port", inner.ports) if inner.ports else ("variable", inner.variables)
                 raise ModelError(f"component '{end.path}' has no {what} '{name}': " + nearest(name, known))
-            end = end[name] if name not in inner.ports else getattr(end, name)
+            if name not in inner.ports:
+                end = end[name]
+            else:  # its name may be that of a method
+                end = inner.ports[name] if end is inner else getattr(end, name)
         if type(end) is not Port and not _is_port(end) and not _is_signal(end):
             owner: Any = getattr(end, "__self__", None)  # a method, as `r.port`, where a port was meant
             if isinstance(type(owner), Construction):

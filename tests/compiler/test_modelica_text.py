@@ -303,7 +303,7 @@ def test_quoted_names_with_subscripts_inside():
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("smoothness", [1, 2, 3, 4, 6])
+@pytest.mark.parametrize("smoothness", [1, 2, 3, 4, 5, 6])
 @pytest.mark.parametrize("extrapolation", [1, 2])
 def test_a_table_of_a_symbol_is_that_of_numbers(smoothness, extrapolation):
     """The Piecewise that equations get has the values of direct evaluation, and those of its nodes."""
@@ -314,6 +314,35 @@ def test_a_table_of_a_symbol_is_that_of_numbers(smoothness, extrapolation):
     for v in np.linspace(-1.0, 6.0, 29):
         assert math.isclose(found(float(v)), table.value(1, float(v), True), rel_tol=1e-9, abs_tol=1e-9)
     assert [table.value(1, x, True) for x in rows[:-1, 0]] == pytest.approx(rows[:-1, 1].tolist())
+
+
+@pytest.mark.parametrize(
+    "smoothness, slopes",
+    [
+        # x = 0, 1, 3, 4, 6; y = 0, 1, 2, 5, 5.5; chords 1, 1/2, 3, 1/4. Inside, Fritsch and Butland (1984, equation 5
+        # with alpha = (1 + h2/(h1 + h2))/3) and Steffen (1990, equations 10 and 11); at the ends the chords.
+        (4, [1.0, 3 * 3 / (5 / 1.0 + 4 / 0.5), 3 * 3 / (4 / 0.5 + 5 / 3.0), 3 * 3 / (5 / 3.0 + 4 / 0.25), 0.25]),
+        (5, [1.0, 2.5 / 3, 1.0, 0.5, 0.25]),
+    ],
+)
+def test_monotone_tables_have_the_slopes_of_the_library(smoothness, slopes):
+    """Both were read as SciPy's PCHIP, whose ends are others and which is not Steffen's inside."""
+    x, y = np.array([0.0, 1.0, 3.0, 4.0, 6.0]), np.array([0.0, 1.0, 2.0, 5.0, 5.5])
+    table = Table(np.stack([x, y], 1), [2], smoothness, 2)
+    h = 1e-6
+    found = [
+        (table.value(1, at + d, True) - table.value(1, at, True)) / d for at, d in zip(x, [h] * 4 + [-h], strict=True)
+    ]
+    assert found == pytest.approx(slopes, abs=1e-4)
+    fine = np.array([table.value(1, float(u), True) for u in np.linspace(0.0, 6.0, 200)])
+    assert (np.diff(fine) > 0).all()
+
+
+def test_a_table_without_extrapolation_has_no_value_outside():
+    table = Table(np.array([[0.0, 1.0], [2.0, 3.0]]), [2], 1, 4)
+    assert [table.value(1, u, False) for u in (0.0, 0.5, 2.0)] == [1.0, 1.5, 3.0]
+    with pytest.raises(ModelError, match=r"the table is read at 2.5, outside of \[0, 2\], without extrapolation"):
+        table.value(1, 2.5, False)
 
 
 @pytest.mark.parametrize("extrapolation", [1, 2])

@@ -38,13 +38,15 @@ class FlatComponent(Component):
         self, ev: EqnEnv, name: str, flat: FlatModel, outputs: Sequence[str] = (), numbers: Sequence[str] = ()
     ):
         super().__init__(ev, name)
-        self.flat = flat
-        scope = Scope(flat, self, frozenset(numbers))
         for number in numbers:
-            if number not in scope.declared or "parameter" not in scope.declared[number].prefixes:
-                raise ModelError(
-                    f"numbers: '{flat.name}' has no parameter '{number}': {nearest(number, scope.declared)}"
-                )
+            if not any(number == d.name and "parameter" in d.prefixes for d in flat.model.declarations):
+                known = [d.name for d in flat.model.declarations]
+                raise ModelError(f"numbers: '{flat.name}' has no parameter '{number}': {nearest(number, known)}")
+        self._write(flat, Scope(flat, self, frozenset(numbers)), outputs)
+
+    def _write(self, flat: FlatModel, scope: Scope, outputs: Sequence[str]) -> None:
+        """Declares what the text declares, and adds its equations and events."""
+        self.flat = flat
         found = scope.definitions
         scope.declare_variables()
         replaced = {variable: equation_of(scope, variable) for variable in flat.laws}

@@ -1,0 +1,106 @@
+"""rumoca, which flattens Modelica source (extra `modelica`), and what it says of a source that it refuses."""
+
+import re
+import shutil
+import tempfile
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..base.errors import ModelError, nearest
+from ..base.optional import optional_module
+from .readable_sources import with_readable_parameters
+from .rumoca_expressions import Json
+
+_PLACE = re.compile(r"× (?P<what>[^\n]*)\s+╭─\[[^\]]*?:(?P<line>\d+):(?P<column>\d+)\]")
+_UNRESOLVED = re.compile(r"unresolved (type reference|function call|component reference|[\w ]+): '([^']+)'")
+_UNBALANCED = re.compile(r"unbalanced model: (\d+) equations, (\d+) unknowns")
+_CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")
+
+
+class Flattened(NamedTuple):
+    """A model as rumoca has flattened it: its name, its equations (`dae`), and its variables as the source declares
+    them (`flat`)."""
+
+    name: str
+    dae: Json
+    flat: Json
+
+
+class FrontEnd:
+    """A session of rumoca with libraries. It reads them when the first model is asked for, which takes some 20 s for
+    the Modelica library, and keeps what it has read."""
+
+    def __init__(self, roots: Sequence[str | Path] = ()):
+        self.roots = [Path(root) for root in roots]
+        self.rumoca = optional_module("rumoca", "modelica", "Modelica source is flattened by rumoca")
+        self.session: Any = None
+        self.readable: list[Path] = []
+
+    def flatten(self, text: str | None, model: str | None, file: Path | None = None) -> Flattened:
+        """Flattens a model of a text, of a file, or, if both are None, of the libraries.
+
+        **Raises:**
+
+        - `ModelError` with what rumoca refuses, and with the place in the text where it says one.
+        """
+        session = self._opened()
+        try:
+            if text is None or file is not None:
+                found = session.load(str(file or self._outermost(model or "")), model=model)
+            else:
+                found = session.loads(text, model=model)
+            return Flattened(found.name, found.to_dict("dae"), found.to_dict("flat"))
+        except (self.rumoca.RumocaError, RuntimeError) as error:
+            raise ModelError(self._said(text or "", model, str(error))) from None
+
+    def _opened(self) -> Any:
+        if self.session is None:
+            folders = [root.parent if (root / "package.mo").exists() else root for root in self.roots]
+            if any(f.is_dir() for f in folders):
+                copies = Path(tempfile.mkdtemp(prefix="modelica-"))
+                weakref.finalize(self, shutil.rmtree, copies, True)
+                folders = [with_readable_parameters(f, copies) if f.is_dir() else f for f in folders]
+            self.readable = folders
+            self.session = self.rumoca.Session(roots=[str(root) for root in self.readable])
+        return self.session
+
+    def _outermost(self, name: str) -> Path:
+        """The file of the outermost package of a class."""
+        first = name.partition(".")[0]
+        for root in self.readable:
+            for file in (root / first / "package.mo", root / f"{first}.mo", root):
+                if file.is_file() and (file is not root or root.stem == first):
+                    return file
+        where = ", ".join(map(str, self.roots)) or "none is given"
+        raise ModelError(f"'{name}' is in none of the roots: {where}; roots=[…] names the folder that holds '{first}'")
+
+    def _said(self, text: str, model: str | None, error: str) -> str:
+        """What rumoca found wrong, with its place."""
+        found = [d.message for d in self.rumoca.validate_source(text, model=model) if d.rule == "syntax-error"]
+        if place := _PLACE.search("\n".join(found)):
+            return f"Modelica, line {place['line']}, column {place['column']}: {place['what'].strip()}"
+        unresolved = sorted(
+            (m.groups() for m in _UNRESOLVED.finditer(error)), key=lambda each: each[0] != "type reference"
+        )
+        if unresolved:
+            kind, name = unresolved[0]
+            at = re.search(rf"(?<![\w.]){re.escape(name)}(?!\w)", text)
+            line = f", line {text.count(chr(10), 0, at.start()) + 1}" if at else ""
+            more = "" if self.roots else "; roots=[…] names the folders of the libraries that the source uses"
+            return f"Modelica{line}: the {kind} '{name}' is not found{more if '.' in name else ''}"
+        known = _CLASS.findall(text)
+        last = (model or "").rpartition(".")[2]
+        if last and last not in known and not self.roots:
+            return f"there is no model '{model}': {nearest(last, known)}"
+        if counts := _UNBALANCED.search(error):
+            equations, unknowns = map(int, counts.groups())
+            which = "are too many" if equations > unknowns else "lack one"
+            counts = f"{_count(equations, 'equation')} for {_count(unknowns, 'unknown')}"
+            return f"'{model or last}' has {counts}; rumoca does not say which of them {which}"
+        return f"rumoca {self.rumoca.version()}: {error}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

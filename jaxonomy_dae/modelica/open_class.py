@@ -1,0 +1,143 @@
+"""A Modelica class with open connectors: what a flattening says of it, without the equations that would close it.
+
+A flattening gives each flow of a connector that nothing is connected to the equation `flow = 0`. These equations go
+out, one for each flow, and a connection of the port takes the place of each. All others are the class's own.
+"""
+
+import dataclasses
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from ..base.errors import ModelError
+from .external_objects import with_external_objects
+from .flat_model import FlatModel
+from .front_end import Flattened
+from .read_rumoca import read_open
+from .rumoca_expressions import Json
+
+AS_TEXT = (
+    "a part of a model that has such connectors inside opens as a whole: write it as a Modelica text with plain "
+    "connectors outside, component(name, source=text, roots=[…])"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenPort:
+    """A connector: pairs (name, unit) of its potentials and of its flows, which are counted positive into the class."""
+
+    name: str
+    potentials: tuple[tuple[str, str], ...]
+    flows: tuple[tuple[str, str], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenClass:
+    """A flattened class whose connectors are open.
+
+    - `name`: of the class, as it was asked for.
+    - `description`: the comment of the class.
+    - `flat`: declarations and equations, without `flow = 0` of the connectors.
+    - `ports`: those of physical connectors. Of a connector of connectors, each innermost one is a port.
+    - `inputs`, `outputs`: names of signals, in the order of the class.
+    - `tunable`: parameters that stand as symbols in the equations.
+    - `required`: those of them without a value.
+    - `fixed`: the other parameters, which decide the equations or are given by the class.
+    """
+
+    name: str
+    description: str
+    flat: FlatModel
+    ports: tuple[OpenPort, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    tunable: tuple[str, ...]
+    required: tuple[str, ...]
+    fixed: tuple[str, ...]
+
+
+def opened(name: str, found: Flattened) -> OpenClass:
+    """A class with open connectors, from its flattening.
+
+    **Raises:**
+
+    - `ModelError` for connectors with stream variables, of overdetermined graphs, and without variables; and for those
+        that have not as many flows as potentials.
+    """
+    if found.flat.get("is_partial"):
+        raise ModelError(f"'{name}' is partial: open a class that extends it, or write one as source=…")
+    ports = tuple(p for top in found.flat["top_level_connectors"] for p in _ports(name, top, found.flat["variables"]))
+    flows = [f"{port.name}.{flow}" for port in ports for flow, _ in port.flows]
+    flat = with_external_objects(read_open(found.dae, name.rpartition(".")[2], flows), found.flat)
+    storage = found.dae["storage"]
+    tunable, required, fixed = [], [], []
+    roles: dict[str, list[str]] = {"input": [], "output": []}
+    declared = {d.name: d for d in flat.model.declarations}
+    entries: dict[str, list[str]] = {}
+    for n in declared:
+        entries.setdefault(re.sub(r"\[[\d,]+\]$", "", n), []).append(n)
+    for v in storage["variables"]:
+        at = v["attributes"]
+        is_real = storage["value_types"][v["value_type"]]["scalar"] == "real"
+        names = [v["name"]] if v["name"] in declared else entries.get(v["name"], [])
+        if v["role"] == "parameter" and at.get("fixed") != [False]:
+            free = is_real and at["is_tunable"] and not found.flat["variable_final_flags"].get(v["name"])
+            (tunable if free else fixed).extend(names)
+            required += [n for n in names if free and declared[n].value is None]
+        elif "." not in re.sub(r"\[[^]]*\]", "", v["name"]) or v["role"] == "input":
+            roles.get(at["causality"], []).extend(names)
+    return OpenClass(
+        name, found.flat.get("model_description") or "", flat, ports, tuple(roles["input"]), tuple(roles["output"]),
+        tuple(tunable), tuple(required), tuple(fixed),
+    )  # fmt: skip
+
+
+def _ports(name: str, top: str, variables: Mapping[str, Json]) -> Iterator[OpenPort]:
+    """The ports of one connector of the class."""
+    inside = {n: v for n, v in variables.items() if n == top or n.startswith((f"{top}.", f"{top}["))}
+    physical = {n: v for n, v in inside.items() if v["causality"] == "Empty" and not _is_constant(v)}
+    where = f"'{name}': the connector '{top}'"
+    if not inside:
+        raise ModelError(f"{where} is expandable: {AS_TEXT}")
+    if any(v["stream"] for v in inside.values()):
+        raise ModelError(f"{where} has stream variables, whose mixing its surroundings decide: {AS_TEXT}")
+    if any(v["is_overconstrained"] for v in inside.values()):
+        raise ModelError(f"{where} is of an overdetermined graph, whose root its surroundings decide: {AS_TEXT}")
+    scalars = {entry: v for n, v in physical.items() for entry in _entries(n, v["dims"])}
+    for group in _innermost(top, list(scalars), scalars):
+        prefix, members = group
+        sides: dict[bool, list[tuple[str, str]]] = {False: [], True: []}
+        for n in members:
+            sides[scalars[n]["flow"]].append((n[len(prefix) + 1 :], scalars[n].get("unit") or ""))
+        if len(sides[False]) != len(sides[True]):
+            counts = f"{len(sides[False])} potentials and {len(sides[True])} flows"
+            raise ModelError(f"'{name}': the connector '{prefix}' has {counts}: {AS_TEXT}")
+        if members:
+            yield OpenPort(prefix, tuple(sides[False]), tuple(sides[True]))
+
+
+def _is_constant(v: Json) -> bool:
+    kind: Any = v["variability"]
+    return (kind if isinstance(kind, str) else next(iter(kind))) in ("Parameter", "Constant")
+
+
+def _entries(name: str, dims: Sequence[int]) -> list[str]:
+    names = [""]
+    for n in dims:
+        names = [f"{before}{',' if before else ''}{k + 1}" for before in names for k in range(n)]
+    return [f"{name}[{place}]" for place in names] if dims else [name]
+
+
+def _innermost(prefix: str, members: Sequence[str], variables: Mapping[str, Json]) -> Iterator[tuple[str, list[str]]]:
+    """The innermost connectors, with the names of their variables: a part of a connector is one by itself if every
+    part has both potentials and flows."""
+    groups: dict[str, list[str]] = {}
+    for n in members:
+        rest = n[len(prefix) :]
+        head = re.match(r"\[[\d,]+\](?=\.)|\.[^.]*(?=\.)", rest)
+        groups.setdefault(prefix + head[0] if head else n, []).append(n)
+    if members and all({variables[n]["flow"] for n in each} == {False, True} for each in groups.values()):
+        for inner, each in groups.items():
+            yield from _innermost(inner, each, variables)
+    else:
+        yield prefix, list(members)

@@ -1,0 +1,258 @@
+"""Modelica classes become classes of components with open ports. NumPy only."""
+
+import json
+import zipfile
+
+import pytest
+from device_library import DEVICES, written_to
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, keep_programs
+from jaxonomy_dae.errors import ModelError
+from jaxonomy_dae.host import kept
+from jaxonomy_dae.library import electrical, thermal
+from jaxonomy_dae.modelica import Library, component
+from jaxonomy_dae.modelica.front_end import FrontEnd
+from jaxonomy_dae.modelica.readable_sources import with_readable_parameters
+from jaxonomy_dae.modelica.shelf import pack
+from jaxonomy_dae.modelica.stored import read, written
+from jaxonomy_dae.write import Electrical, Rotational, Thermal
+from jaxonomy_dae.write.ports import Port
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    before = list(kept._CHOSEN)
+    keep_programs(None)
+    yield Library(written_to(tmp_path_factory.mktemp("devices")))
+    kept._CHOSEN[:] = before
+
+
+def domains(part):
+    return {name: port.domain for name, port in part.ports.items()}
+
+
+def test_connectors_are_ports_of_our_domains(library):
+    ev = EqnEnv()
+    R = library.component("Devices.Resistor", useHeatPort=True)
+    assert domains(R(ev, "r", R=2.0)) == {"p": Electrical, "n": Electrical, "heatPort": Thermal}
+    assert set(domains(library["Devices.Resistor"](ev, "r", R=2.0))) == {"p", "n"}
+    assert domains(library["Devices.Inertia"](ev, "j")) == {"a": Rotational}
+    gap = library["Devices.Gap"](ev, "g")
+    assert gap.a.domain == gap.b.domain
+    assert (gap.a.domain.across, gap.a.domain.through) == ((("V_m", "A"),), (("Phi", "Wb"),))
+    load = library["Devices.Load"](ev, "l", R=[1.0, 2.0, 3.0])
+    assert [(p.name, p.domain) for p in load.plug] == [(f"plug.pin[{k}]", Electrical) for k in (1, 2, 3)]
+    assert isinstance(load.star, Port)
+    assert len(library.component("Devices.Load", m=2)(ev, "l").plug) == 2
+
+
+def test_only_the_equations_that_close_connectors_go_out(library):
+    """The sensor's own `p.i = 0` stays. Each class lacks one equation for each flow of its ports."""
+    counts = {}
+    for name in ("Resistor", "Conductor", "Sensor", "Brake", "Load"):
+        of = library[f"Devices.{name}"].opened
+        unknowns = [d for d in of.flat.model.declarations if not d.prefixes & {"parameter", "constant", "input"}]
+        flows = sum(len(p.flows) for p in of.ports)
+        counts[name] = len(unknowns) - len(of.flat.model.equations) - flows
+    assert counts == dict.fromkeys(counts, 0)
+    assert len(library["Devices.Sensor"].opened.flat.model.equations) == 2
+
+
+def test_parameters_are_symbols_or_required_or_given_when_the_class_is_opened(library):
+    ev = EqnEnv()
+    Resistor = library["Devices.Resistor"]
+    assert (Resistor.opened.required, Resistor.opened.fixed) == (("R",), ("useHeatPort",))
+    assert Resistor(ev, "r", R=3.0, alpha=0.1).parameters["R"].value == 3.0
+    load = library["Devices.Load"](ev, "l", R=[1.0, 2.0, 3.0])
+    assert [load.parameters[f"R[{k}]"].value for k in (1, 2, 3)] == [1.0, 2.0, 3.0]
+    assert str(load.parameters["phase[2].R"].value) == "R[2]"
+    start = library["Devices.Capacitor"](ev, "c", start={"v": 0.5})
+    assert (start.parameters["initial_v"].value, start.variables["v"].fixed) == (0.5, True)
+    with pytest.raises(ModelError, match=r"Devices.Resistor 'r': the class gives no value to 'R': Resistor\(…, R=…\)"):
+        Resistor(ev, "r")
+    with pytest.raises(ModelError, match=r"'useHeatPort' decides .* component\(\"Devices.Resistor\", …, useHeatPort="):
+        Resistor(ev, "r", R=1.0, useHeatPort=True)
+    with pytest.raises(ModelError, match=r"the class has no parameter 'Alpha': did you mean 'alpha'\?"):
+        Resistor(ev, "r", R=1.0, Alpha=0.0)
+    with pytest.raises(ModelError, match=r"the parameter 'R' has the entries 'R\[1\]', .* got the shape \(2,\)"):
+        library["Devices.Load"](ev, "l", R=[1.0, 2.0])
+    with pytest.raises(ModelError, match=r"start: there is no variable 'V': known names: 'p.v'"):
+        library["Devices.Capacitor"](ev, "c", start={"V": 0.5})
+
+
+def test_modifications_decide_the_equations(library):
+    cubic = library.component("Devices.Conductor", law="Devices.Law.cubic", G=0.25)
+    assert "v**3" in str(cubic(EqnEnv(), "g").equations).replace("v*v*v", "v**3")
+    assert cubic(EqnEnv(), "g").parameters["G"].value == 0.25
+    inner = library.component("Devices.Load", **{"phase.alpha": [0.1, 0.2, 0.3]})
+    load = inner(EqnEnv(), "l")
+    assert [load.parameters[f"phase[{k}].alpha"].value for k in (1, 2, 3)] == [0.1, 0.2, 0.3]
+    with pytest.raises(ModelError, match=r"'Devices.Resistor' has no 'usePort' to modify: did you mean 'useHeatPort'"):
+        library.component("Devices.Resistor", usePort=True)
+    with pytest.raises(ModelError, match=r"the modification 'G' is a number, a truth"):
+        library.component("Devices.Conductor", G=object())
+
+
+def test_a_network_of_open_classes_and_own_parts_is_square(library):
+    """A heated resistor of Modelica between our source, our capacity and our inertia by an adaptor of ours."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    r = library.component("Devices.Resistor", useHeatPort=True)(ev, "r", R=2.0)
+    v, g, c = electrical.VoltageSource(ev, "v", V=1.0), electrical.Ground(ev, "g"), thermal.HeatCapacitor(ev, "c", 3.0)
+    motor, j = electrical.DCMotor(ev, "m"), library["Devices.Inertia"](ev, "j", J=0.1)
+    diagram.add(r, v, g, c, motor, j)
+    diagram.connect(v.p, r.p)
+    diagram.connect(r.n, motor.p)
+    diagram.connect(motor.n, v.n, g.p)
+    diagram.connect(r.heatPort, c.heat)
+    diagram.connect(motor.flange, j.a)
+    system = AcausalCompiler(ev, diagram)()
+    assert "j.w" in system.variables and "r.heatPort.Q_flow" in system.variables
+    with pytest.raises(ModelError, match=r"cannot connect 'j.a' \(Rotational\) to 'r.p' \(Electrical\)"):
+        AcausalDiagram().connect(r.p, j.a)
+
+
+@pytest.mark.parametrize(
+    "name, told",
+    [
+        (
+            "Devices.Pipe",
+            r"the connector 'a' has stream variables, whose mixing its surroundings decide: .* source=text",
+        ),
+        ("Devices.Open", r"'Devices.Open' has 2 equations for 3 unknowns; .* lack one"),
+        ("Devices.OnePort", r"'Devices.OnePort' is partial: open a class that extends it"),
+        ("Devices.Resistorr", r"'Devices' has no class 'Resistorr': did you mean 'Resistor'"),
+        ("Device.Resistor", r"'Device.Resistor' is in none of the roots: .*Devices.mo; roots="),
+    ],
+)
+def test_classes_that_do_not_open(library, name, told):
+    with pytest.raises(ModelError, match=told):
+        library[name]
+
+
+def test_roots_that_do_not_exist():
+    with pytest.raises(ModelError, match=r"roots: there is no '/nowhere/libraries'"):
+        component("A", roots="/nowhere/libraries")
+
+
+def test_a_part_of_a_system_opens_as_a_whole():
+    """Streams are mixed inside a text; its flanges and pins are open."""
+    text = DEVICES.replace(
+        "end Devices;",
+        """
+  model Heater "two pipes in a row, the second driven by a signal"
+    RealInput power;
+    RealOutput h;
+    Pipe2 first, second;
+    Boundary inlet(h = 7), outlet(h = 3);
+  equation
+    connect(inlet.port, first.a);
+    connect(first.b, second.a);
+    connect(second.b, outlet.port);
+    first.Q = 0;
+    second.Q = power;
+    h = second.b.h_outflow;
+  end Heater;
+  model Boundary
+    parameter Real h = 1, flow_out = 0;
+    FluidPort port;
+  equation
+    port.h_outflow = h;
+    port.p = h;
+  end Boundary;
+  model Pipe2
+    FluidPort a, b;
+    Real Q;
+  equation
+    a.m_flow + b.m_flow = 0;
+    a.m_flow = a.p - b.p;
+    b.h_outflow = inStream(a.h_outflow) + Q;
+    a.h_outflow = inStream(b.h_outflow) + Q;
+  end Pipe2;
+end Devices;""",
+    )
+    Heater = component("Devices.Heater", source=text)
+    assert (Heater.opened.inputs, Heater.opened.outputs, Heater.opened.ports) == (("power",), ("h",), ())
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(Heater(ev, "heater"))
+    assert "heater.h" in AcausalCompiler(ev, diagram)().variables
+
+
+def test_a_known_class_needs_no_front_end(tmp_path, monkeypatch):
+    """The second library reads what the first has kept; a changed source is another library."""
+    before = list(kept._CHOSEN)
+    keep_programs(tmp_path / "kept")
+    try:
+        file = written_to(tmp_path)
+        first = Library(file).component("Devices.Conductor", law="Devices.Law.cubic").opened
+        with monkeypatch.context() as without:
+            without.setattr(FrontEnd, "flatten", lambda *_: pytest.fail("the front end was asked"))
+            assert Library(file).component("Devices.Conductor", law="Devices.Law.cubic").opened == first
+        file.write_text(DEVICES.replace("parameter Real G = 0.5", "parameter Real G = 0.75"))
+        changed = Library(file)["Devices.Conductor"](EqnEnv(), "g")
+        assert changed.parameters["G"].value == 0.75
+        for kept_class in (tmp_path / "kept" / "modelica").glob("*.gz"):
+            kept_class.write_bytes(b"not whole")
+        assert Library(file)["Devices.Conductor"](EqnEnv(), "g").parameters["G"].value == 0.75
+    finally:
+        kept._CHOSEN[:] = before
+
+
+def test_classes_are_data(library, tmp_path):
+    """All of a class comes back from JSON; a pack of classes is a library, byte for byte the same each time."""
+    names = ["Resistor", "Conductor", "Switch", "Load", "Brake"]
+    classes = [library[f"Devices.{n}"].opened for n in names]
+    for each in classes:
+        assert read(json.loads(json.dumps(written(each)))) == each
+    for file in ("a.zip", "b.zip"):
+        pack(tmp_path / file, classes, {"of": "Devices"})
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+    packed = Library(tmp_path / "a.zip")
+    assert packed["Devices.Load"](EqnEnv(), "l").ports.keys() == library["Devices.Load"](EqnEnv(), "l").ports.keys()
+    with pytest.raises(
+        ModelError, match=r"there is no class 'Devices.Swich' in .*a.zip: did you mean 'Devices.Switch'"
+    ):
+        packed["Devices.Swich"]
+    with pytest.raises(ModelError, match=r"'Devices.Load' is packed without the modifications 'm = 2': roots="):
+        packed.component("Devices.Load", m=2)
+    with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
+        archive.writestr("A.json", json.dumps({"format": 0}))
+    with pytest.raises(ModelError, match=r"this is no class of format 1: it has format 0"):
+        Library(tmp_path / "c.zip")["A"]
+    (tmp_path / "d.zip").write_bytes(b"none")
+    with pytest.raises(ModelError, match=r"'.*d.zip' is not a file of packed classes"):
+        Library(tmp_path / "d.zip")["A"]
+
+
+def test_parameters_by_look_ups_in_tables_become_initial_equations(tmp_path):
+    """Lines stay where they are, and other files are read through links."""
+    clutch = """within Parts;
+model Clutch
+  parameter Real table[:, 2] = [0, 1];
+  final parameter Real mu0(unit = "1") =
+    if table[1, 1] > 0 then getTable1DValue(tableID, 1, 0)
+    else getTable1DValueNoDer(tableID, 1, 0)
+    "at rest";
+initial equation
+  w = 0;
+equation
+  tau = mu0;
+end Clutch;
+"""
+    root = tmp_path / "lib"
+    (root / "Parts" / "Other").mkdir(parents=True)
+    (root / "Parts" / "package.mo").write_text("package Parts\nend Parts;\n")
+    (root / "Parts" / "Other" / "package.mo").write_text("within Parts;\npackage Other\nend Other;\n")
+    (root / "Parts" / "Clutch.mo").write_text(clutch)
+    copies = tmp_path / "copies"
+    copies.mkdir()
+    copy = with_readable_parameters(root, copies)
+    lines = (copy / "Parts" / "Clutch.mo").read_text().splitlines()
+    assert len(lines) == len(clutch.splitlines())
+    assert lines[3].strip() == 'final parameter Real mu0(unit = "1", fixed = false)'
+    assert lines[9] == (
+        "initial equation mu0 = if table[1, 1] > 0 then getTable1DValue(tableID, 1, 0) "
+        "else getTable1DValueNoDer(tableID, 1, 0); equation"
+    )
+    assert (copy / "Parts" / "Other" / "package.mo").read_text().startswith("within Parts;")
+    (root / "Parts" / "Clutch.mo").write_text(clutch.replace("getTable1D", "getTable2D"))
+    assert with_readable_parameters(root, copies) == root
