@@ -52,6 +52,7 @@ def flow(level):
     return scipy.optimize.brentq(missing, 0.0, 10.0, xtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_pump_that_is_switched_off_in_a_nonlinear_block():
     """dp = on·curve(m_flow) cannot be solved for the curve once on = 0; then the valve shuts, and the level stays."""
     system = pumped()

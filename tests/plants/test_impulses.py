@@ -37,6 +37,7 @@ def common(charge, law):
     return scipy.optimize.brentq(lambda v: law(v) - charge, -10, 10, xtol=1e-15)
 
 
+@pytest.mark.slow
 def test_charge_is_conserved_where_capacitance_depends_on_voltage():
     """q = v + k·v³: the derivative of the common voltage by k follows from that of the charge."""
     system = compiled(Joined(EqnEnv(), "c"))
