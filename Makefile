@@ -19,12 +19,13 @@ endef
 
 pip = $(1)/bin/python -m pip --disable-pip-version-check
 
-.PHONY: help demo test test-all test-floors attack lint types docs wheel check bench notebook clean
+.PHONY: help demo test test-slow test-all test-floors attack lint types docs wheel check bench notebook clean
 
 help:
 	@echo "demo         train the pendulum's drag network (examples/)"
 	@echo "test         quick tests;  test-floors: a share of them on the oldest dependencies"
-	@echo "test-all     the slow ones too;  test-all PART=3/8: the third of eight parts"
+	@echo "test-slow    slow tests for so long, those that waited longest first: make test-slow MINUTES=25"
+	@echo "test-all     all tests;  test-all PART=3/8: the third of eight parts"
 	@echo "attack       random models for so many minutes: make attack MINUTES=10 [SEED=7] [FAMILY=events]"
 	@echo "check        lint, types, test, docs, wheel: all that must pass"
 	@echo "bench        benchmarks;  notebook: execute the example notebooks in place;  clean: remove products"
@@ -69,6 +70,11 @@ test-all: $(VENV)/.stamp-dev
 
 # Asked before anything is made.
 $(if $(filter attack,$(MAKECMDGOALS)),$(if $(MINUTES),,$(error how many minutes? make attack MINUTES=10)))
+$(if $(filter test-slow,$(MAKECMDGOALS)),$(if $(MINUTES),,$(error how many minutes? make test-slow MINUTES=25)))
+
+# When the time is spent, no further test begins. tests/slow_box.py says in which order they run.
+test-slow: $(VENV)/.stamp-dev
+	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL) $(SLOWEST) -m slow --minutes "$(MINUTES)"
 
 # Draws models of all families in turn, with two processes; prints the seed, which repeats a run, and a table.
 attack: $(VENV)/.stamp-dev

@@ -12,6 +12,7 @@ from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File
 
 TITLE = "Gallery"
+REPOSITORY = "jaxonomy-dae/jaxonomy_dae"  # on GitHub
 EXAMPLES = pathlib.Path(__file__).parents[1] / "examples"
 
 
@@ -91,6 +92,12 @@ def last_figure_of(notebook: pathlib.Path) -> tuple[str, bytes]:
     return "png", base64.b64decode("".join(last["image/png"]))
 
 
+def colab_button(entry: Entry) -> str:
+    """A link that opens the notebook of the main branch in Colab."""
+    path = entry.path.relative_to(EXAMPLES.parent).as_posix()
+    return f"[Open in Colab](https://colab.research.google.com/github/{REPOSITORY}/blob/main/{path}){{ .md-button }}"
+
+
 def overview() -> str:
     """The first page: what each notebook teaches, how long it runs, and its last figure."""
     lines = [
@@ -99,6 +106,12 @@ def overview() -> str:
         "Longer studies, ordered by level. Each teaches one idea and says what it could not show. Open a notebook from",
         "the folder `examples` of the repository, or download it here. Times are processor time of a first",
         "run, most of it compilation, where XLA optimizes little.",
+        "",
+        "In Colab, run this cell first:",
+        "",
+        '```python title="Fragment"',
+        f'%pip install "jaxonomy_dae[plot] @ git+https://github.com/{REPOSITORY}"',
+        "```",
         "",
     ]
     for level, members in LEVELS.items():
@@ -109,7 +122,7 @@ def overview() -> str:
             lines += [f"### [{title_of(entry.path)}]({name})", ""]
             download = f'[Download]({entry.stem}.txt){{ download="{entry.path.name}" }}'
             time = f" *About {entry.time}.*" if entry.time else ""
-            lines += [f"{entry.idea}{time}{data} {download}"]
+            lines += [f"{entry.idea}{time}{data} {download} {colab_button(entry)}"]
             lines += ["", f"[![The last figure]({entry.stem}.{last_figure_of(entry.path)[0]})]({name})", ""]
     return "\n".join(lines)
 

@@ -1,78 +1,34 @@
 """Differentiable acausal modeling: components and equations in, one Equinox module out."""
 
-# Functions of SymPy that equations are written with, so that a model needs one import.
-from sympy import Abs as Abs
-from sympy import And as And
-from sympy import Heaviside as Heaviside
-from sympy import Max as Max
-from sympy import Min as Min
-from sympy import Ne as Ne
-from sympy import Not as Not
-from sympy import Or as Or
-from sympy import Piecewise as Piecewise
-from sympy import acos as acos
-from sympy import asin as asin
-from sympy import atan as atan
-from sympy import atan2 as atan2
-from sympy import ceiling as ceiling
-from sympy import cos as cos
-from sympy import cosh as cosh
-from sympy import exp as exp
-from sympy import floor as floor
-from sympy import log as log
-from sympy import pi as pi
-from sympy import sign as sign
-from sympy import sin as sin
-from sympy import sinh as sinh
-from sympy import sqrt as sqrt
-from sympy import tan as tan
-from sympy import tanh as tanh
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
-from .analysis import FrequencyResponse as FrequencyResponse
-from .analysis import OperatingPoint as OperatingPoint
-from .analysis import StateSpace as StateSpace
-from .analysis import Sweep as Sweep
-from .analysis import frequency_response as frequency_response
-from .analysis import linearize as linearize
-from .analysis import steady_state as steady_state
-from .analysis import sweep as sweep
-from .base.errors import InitializationError as InitializationError
-from .base.errors import JaxonomyDaeError as JaxonomyDaeError
-from .base.errors import ModelError as ModelError
-from .base.errors import SimulationError as SimulationError
-from .base.errors import SteadyStateError as SteadyStateError
-from .base.errors import StructuralError as StructuralError
-from .base.errors import UnitError as UnitError
-from .host.compilations import Compilation as Compilation
-from .host.compilations import compilations as compilations
-from .host.kept import keep_programs as keep_programs
-from .run.simulation.saved_programs import load_compiled as load_compiled
-from .run.simulation.saved_programs import save_compiled as save_compiled
-from .run.simulation.saved_state import SavedState as SavedState
-from .run.simulation.simulate import simulate as simulate
-from .run.simulation.solution import Solution as Solution
-from .run.system.acausal_compiler import AcausalCompiler as AcausalCompiler
-from .run.system.system import AcausalSystem as AcausalSystem
-from .write import NONNEGATIVE as NONNEGATIVE
-from .write import POSITIVE as POSITIVE
-from .write import AcausalDiagram as AcausalDiagram
-from .write import Component as Component
-from .write import Domain as Domain
-from .write import Electrical as Electrical
-from .write import Eq as Eq
-from .write import EqnEnv as EqnEnv
-from .write import Hydraulic as Hydraulic
-from .write import Interval as Interval
-from .write import NeuralDAEBlock as NeuralDAEBlock
-from .write import Planar as Planar
-from .write import Rotational as Rotational
-from .write import Thermal as Thermal
-from .write import Translational as Translational
-from .write import assign as assign
-from .write import der as der
-from .write import pre as pre
-from .write import reinit as reinit
-from .write import smooth as smooth
-from .write import terminate as terminate
+if TYPE_CHECKING:  # for editors and type checkers
+    from .names import *  # noqa: F403
 
 __version__ = "0.1.0"
+
+
+def _public() -> list[str]:
+    """Reads all public names. They rest on some three hundred modules, whose import takes half as long as that of JAX
+    and its libraries: what uses none of them, or a part of the package alone, does without."""
+    names = {name: value for name, value in vars(import_module(".names", __name__)).items() if name[0] != "_"}
+    globals().update(names)
+    return sorted(names)
+
+
+def __getattr__(name: str) -> object:
+    if name == "__all__":
+        return _public()
+    if not name.startswith("__"):  # what Python and its tools look for in every module
+        if find_spec(f"{__name__}.{name}") is not None:
+            return import_module(f".{name}", __name__)
+        if name in _public():
+            return globals()[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    _public()
+    return sorted(globals())

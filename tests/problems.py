@@ -9,13 +9,14 @@ import pathlib
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.integrate
 import scipy.special
 from jax.flatten_util import ravel_pytree
@@ -282,6 +283,14 @@ def run(program: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+# --- parameters of tests -----------------------------------------------------------------------------------------
+
+
+def slow(cases: Iterable[Any], *these: Any) -> list[Any]:
+    """Parameters of a test, these of them marked slow."""
+    return [pytest.param(case, marks=pytest.mark.slow) if case in these else case for case in cases]
 
 
 # --- texts -------------------------------------------------------------------------------------------------------

@@ -154,7 +154,7 @@ class _Simulation(eqx.Module):
         return simulate(system, **self.options)
 
 
-@functools.partial(compiled, runs_once=False)
+@functools.partial(compiled, optimize=True)
 def _mapped(function: Callable, system: AcausalSystem, names: tuple[str, ...], rows: tuple[Array, ...]) -> PyTree:
     def one(row):
         return function(system.with_parameters(dict(zip(names, row, strict=True))))

@@ -107,9 +107,8 @@ WINDOW = 1e-6
 # more, the event asked for what the constraints do not admit, and the projection would decide what was meant
 # (test_event_attacks.py::test_a_reset_that_hidden_constraints_do_not_admit).
 CONSISTENT = 1e-4
-# Part of the speed (or charge) that an impulse takes away that may be left of it. The impulse is found by one linear
-# step, exact if the jump is affine; more left than this shows that it is not
-# (test_library_contacts.py::test_a_jump_that_is_not_affine_is_refused).
+# Part of the speed (or charge) that an impulse takes away that may be left of it: more shows that no impulse enforces
+# the constraint, as where another one contradicts it.
 LEFT = 1e-6
 PULL = 1e-9  # of the largest impulse: contacts that pull by less do so by rounding alone, and are not released
 # 1/s, relative to the size of a state: a slope that is slower counts as zero in analyses, for it would take 1e17 years

@@ -1,11 +1,17 @@
 """Programs compiled for calls with plain arrays, kept while there is room.
 
+A program is looked up by what it computes: the content of its function and of all that is static among its arguments
+(`content.py`), the types of its arrays, the options of JAX. So it serves whatever has the same content, and nothing
+else. Where the content cannot be seen, the function is traced at every call, and the text of the program decides.
+
 `equinox.filter_jit` keeps every program for ever, also those of models and functions that are gone: its cache refers
-to the functions that it is looked up by. Here each program can be dropped, with its derivatives and batches.
+to the functions that it is looked up by. Here each program can be dropped, with its derivatives and batches, and none
+holds the function, nor what it closes over.
 """
 
 import functools
 import gc
+import os
 import threading
 import time
 import warnings
@@ -19,12 +25,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.aliases import PyTree
+from .content import content
 from .kept import folder
-from .lasting import lasting
+from .libraries import Changed, code
 from .machine import Use, mappings, memory, return_memory
-from .reasons import Place, reason
+from .reasons import Call, Place, reason
 from .staging import is_traced
-from .transformed import Function
+from .transformed import Function, Traceable
 
 # Of the mappings that Linux allows, and of the memory that this process could have. What is left must hold what is
 # compiled until use is measured next: a gradient takes 800 (two states) to 4,500 mappings (double pendulum), 7 %.
@@ -33,6 +40,7 @@ FULL = 0.75  # beyond which, with none left here to go, JAX's own caches are cle
 AGAIN = 0.125  # by which use must have grown since something was freed: programs in use must not push each other out
 COUNT = 64  # programs kept where the system says nothing: 4 GB at the 66 MB of the tutorial's
 PART = 4  # one of so many programs goes before use is measured again
+MOST_TEXTS = 1000  # digests of texts that are remembered
 PAUSE = 100  # a measurement takes some 2 µs for each mapping, up to 0.1 s; 1 % of the time may go into it
 
 _P = ParamSpec("_P")
@@ -40,32 +48,77 @@ _T = TypeVar("_T")
 
 
 class _Called:
-    """A function for certain static values; `calls` counts the calls that have not returned yet."""
+    """The programs of one content; `calls` counts the calls that have not returned yet, `call` is what they are."""
 
-    def __init__(self, function: Callable, runs_once: bool, structure: Any, static: tuple[Any, ...], why: str):
-        def run(arrays: list[Array]) -> PyTree:
-            rest = iter(arrays)
-            leaves = [next(rest) if leaf is Place.ARRAY else leaf for leaf in static]
-            args, kwargs = jax.tree.unflatten(structure, leaves)
-            return function(*args, **kwargs)
+    def __init__(self, call: Call, why: str, optimize: bool, identity: str | None):
+        self.call, self.calls = call.without_function(), 0
+        self.function = Function(getattr(call.function, "__name__", "run"), why, optimize, identity)
 
-        self.calls = 0
-        identity = None if folder() is None else lasting(function, structure, static)
-        self.function = Function(run, getattr(function, "__name__", "run"), why, runs_once, identity)
+
+def _flat(call: Call) -> Traceable:
+    """The function of a call, of the arrays among its arguments alone."""
+    function, structure, static = call.function, call.structure, call.static
+
+    def run(arrays: list[Array]) -> PyTree:
+        rest = iter(arrays)
+        leaves = [next(rest) if leaf is Place.ARRAY else leaf for leaf in static]
+        args, kwargs = jax.tree.unflatten(structure, leaves)
+        return function(*args, **kwargs)
+
+    return run
+
+
+def _call_of(function: Callable, args: tuple[PyTree, ...], kwargs: dict[str, PyTree]) -> tuple[Call, list[Array]]:
+    leaves, structure = jax.tree.flatten((args, kwargs))
+    # Those of NumPy, such as weights of a user's, lie nowhere yet.
+    arrays = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+    static = tuple(Place.ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
+    return Call(function, structure, static, tuple(jax.typeof(a) for a in arrays), _surroundings(arrays)), arrays
+
+
+def options() -> list[tuple[str, object]]:
+    """JAX's options as they are now, in this thread."""
+    config: Any = jax.config
+    return [(name, getattr(config, name, value)) for name, value in config.values.items()]
+
+
+_OPTIONS: list[tuple[list[tuple[str, object]], str]] = []  # those seen last, and their digest
+
+
+def _of_options() -> str:
+    now = options()
+    for before, digest in _OPTIONS:
+        if len(before) == len(now) and all(a[1] is b[1] for a, b in zip(before, now, strict=True)):
+            return digest
+    digest = content(now).digest
+    _OPTIONS[:] = [(now, digest)]
+    return digest
 
 
 def _surroundings(arrays: list[Array]) -> Hashable:
     """What else decides about a program: where its arrays lie, and JAX's options."""
-    config: Any = jax.config
     where = frozenset(d for a in arrays if not is_traced(a) for d in a.devices())
-    return (
-        where, config.jax_default_device, config.jax_enable_x64, config.jax_default_matmul_precision,
-        config.jax_numpy_dtype_promotion, config.jax_numpy_rank_promotion,
-    )  # fmt: skip
+    return where, _of_options()
+
+
+def _identity(digest: str) -> str | None:
+    """A digest of what a call computes, the same in every process; None if programs are not kept for other processes,
+    or if the code that runs may be another one than its files say."""
+    if folder() is None:
+        return None
+    try:
+        return content(digest, code(), options(), _environment()).digest
+    except Changed:
+        return None
+
+
+def _environment() -> list[object]:
+    variables = [(k, v) for k, v in os.environ.items() if k.startswith(("JAX_", "XLA_", "EQX_", "JAXTYPING"))]
+    return [*sorted(variables), jax.device_count()]
 
 
 class ProgramCache:
-    """Programs by function, structure, static values, shapes and dtypes; the most recently used is the last."""
+    """Programs by content, types and options; the most recently used is the last."""
 
     def __init__(self):
         self._programs: OrderedDict[Hashable, _Called] = OrderedDict()
@@ -73,27 +126,40 @@ class ProgramCache:
         self._next = 0.0  # when use may be measured again, in seconds of `time.perf_counter`
         self._left: dict[Callable, int] = {mappings: 0, memory: 0}  # what freeing left, of each
         self._warned = False
+        self._texts: dict[Hashable, str | None] = {}  # of programs whose content was not seen
+        self._held: list[Function] = []  # the last of these, so that what was compiled of them stays
 
     def __len__(self) -> int:
         return len(self._programs)
 
-    def call(self, function: Callable, runs_once: bool, args: tuple[PyTree, ...], kwargs: dict[str, PyTree]) -> PyTree:
+    def __content__(self) -> tuple[str, tuple]:
+        """For `content.py`: which programs there are decides nothing of what they compute."""
+        return "programs", ()
+
+    def call(self, function: Callable, optimize: bool, args: tuple[PyTree, ...], kwargs: dict[str, PyTree]) -> PyTree:
         """Calls `function(*args, **kwargs)` through the program compiled at the first call of this kind."""
-        leaves, structure = jax.tree.flatten((args, kwargs))
-        # Those of NumPy, such as weights of a user's, lie nowhere yet.
-        arrays = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
-        static = tuple(Place.ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
-        key = function, structure, static, tuple(jax.typeof(a) for a in arrays), _surroundings(arrays)
+        call, arrays = _call_of(function, args, kwargs)
+        found = content(call.function, call.structure, call.static)
+        key = found.digest, optimize, call.types, call.around
+        if found.unseen:
+            return self._called_unseen(call, key, optimize, arrays, found.unseen)
+        return self._run(key, self._program(key, call, optimize), call, arrays)
+
+    def _program(self, key: tuple[str, bool, Hashable, Hashable], call: Call, optimize: bool) -> _Called:
         with self._lock:
             program = self._programs.get(key)
             if program is None:
                 self.make_room()
-                why = reason(key, self._programs)
-                program = self._programs[key] = _Called(function, runs_once, structure, static, why)
+                why = reason(call, [one.call for one in self._programs.values()])
+                program = self._programs[key] = _Called(call, why, optimize, _identity(key[0]))
             self._programs.move_to_end(key)
+            return program
+
+    def _run(self, key: Hashable, program: _Called, call: Call, arrays: list[Array]) -> PyTree:
+        with self._lock:
             program.calls += 1
         try:
-            outcome = program.function(arrays)
+            outcome = program.function(_flat(call), arrays)
         finally:
             with self._lock:
                 program.calls -= 1
@@ -103,10 +169,51 @@ class ProgramCache:
                 self._programs.pop(key, program).function.clear()
         return outcome
 
+    def looped(self, function: Callable[_P, _T], optimize: bool = False) -> Callable[_P, _T]:
+        """The function for a loop of calls, compiled as by `call`, with what it reads as it is at the first call of
+        each kind: the calls that follow do not look at it again. Hold it no longer than the loop lasts."""
+        known: dict[Hashable, tuple[Hashable, _Called]] = {}
+
+        @functools.wraps(function)
+        def called(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+            call, arrays = _call_of(function, args, kwargs)
+            kind = call.structure, call.static, tuple(map(type, call.static)), call.types, call.around
+            if kind not in known:
+                found = content(call.function, call.structure, call.static)
+                key = found.digest, optimize, call.types, call.around
+                why = "it belongs to one loop, as nothing tells what it reads"
+                known[kind] = (
+                    key,
+                    (_Called(call, why, optimize, None) if found.unseen else self._program(key, call, optimize)),
+                )
+            return self._run(*known[kind], call, arrays)
+
+        return called
+
+    def _called_unseen(
+        self, call: Call, key: Hashable, optimize: bool, arrays: list[Array], unseen: tuple[str, ...]
+    ) -> PyTree:
+        """Calls a function whose content is not seen: it is traced, and what is compiled serves as long as its text
+        stays the same. Says so where it does not."""
+        name = getattr(call.function, "__name__", "run")
+        program = Function(name, f"nothing tells whether it has changed: it reads {unseen[0]}", optimize)
+        outcome = program(_flat(call), arrays)
+        with self._lock:
+            if len(self._texts) > MOST_TEXTS:
+                self._texts.clear()
+            before = self._texts.get(key)
+            self._texts[key] = program.text
+            self._held.append(program)
+            del self._held[:-COUNT]
+        if before is not None and program.text is not None and before != program.text:
+            warnings.warn(_changing(unseen), RuntimeWarning, stacklevel=4)
+        return outcome
+
     def clear(self) -> None:
         """Drops all programs that are not running."""
         with self._lock:
             self._let_go(len(self))
+            self._held.clear()
 
     def make_room(self) -> None:
         """Drops programs if they use too much of the machine. Called before a program is compiled."""
@@ -165,18 +272,26 @@ def _text(use: Use) -> str:
     )
 
 
+def _changing(unseen: tuple[str, ...]) -> str:
+    return (
+        f"a function computes something else than when it was called last, and is compiled anew: it reads "
+        f"{', '.join(unseen[:3])}. What it reads is fixed when it is traced. Give it as a parameter, an input or an "
+        "argument, so that it may change without a compilation"
+    )
+
+
 PROGRAMS = ProgramCache()
 
 
-def compiled(function: Callable[_P, _T], runs_once: bool = True) -> Callable[_P, _T]:
-    """The function, compiled at the first call for each structure, static values and shapes, as by
-    `equinox.filter_jit`. Programs are let go if there are more than the machine has room for.
+def compiled(function: Callable[_P, _T], optimize: bool = False) -> Callable[_P, _T]:
+    """The function, compiled at the first call for each content, structure, static values and shapes. Programs are let
+    go if there are more than the machine has room for.
 
-    `runs_once` False says that its runs take more time than any compilation: it is optimized at once (`tiers.py`).
+    `optimize`: compile it with all optimizations, for what is called so often, or runs so long, that this pays.
     """
 
     @functools.wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
-        return PROGRAMS.call(function, runs_once, args, kwargs)
+        return PROGRAMS.call(function, optimize, args, kwargs)
 
     return call

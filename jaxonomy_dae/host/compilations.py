@@ -13,7 +13,7 @@ class Compilation(NamedTuple):
     """One program that was compiled, or read from the folder of kept programs.
 
     - `name`: the name of the function. "gradient of run" is the transposed program.
-    - `how`: "quick", "optimized", or "loaded" from the folder.
+    - `how`: "quick", "optimized", or "loaded" from the folder; "refused" if a folder is not used, and `why` says why.
     - `why`: why the program was necessary.
     - `traced`, `lowered`, `compiled`: processor seconds, all threads together.
     """

@@ -2,8 +2,12 @@
 
 A file holds an executable that XLA made for one processor. Its name is a digest of the program as StableHLO, the
 compiler's options, the versions of JAX and its library, the platform, and the processor's features, so that no other
-processor loads it. Another file says which executable a call needs (`lasting.py`), so that the call need not be traced
-to find it. Where the user has chosen a folder for JAX's own compilation cache, that one serves instead.
+processor loads it. Another file says, as data, which executable a call needs (`cache.py`, `written.py`), so that the
+call need not be traced to find it. Where the user has chosen a folder for JAX's own compilation cache, that one serves
+instead.
+
+Executables are native code. So the folder must belong to the user, nobody else may write into it, and no link leads to
+a file in it. Only files that this module wrote, which it knows by their names, are counted, read and deleted.
 """
 
 import contextlib
@@ -11,7 +15,8 @@ import functools
 import hashlib
 import os
 import platform as machine
-import struct
+import re
+import stat
 import sys
 import tempfile
 import zlib
@@ -22,11 +27,14 @@ from typing import Any, TypeAlias
 import jax
 
 from ..base.private_names import MissingName, private
+from .compilations import Compilation, noted
+from .platform import platform
 
 VARIABLE = "JAXONOMY_DAE_CACHE"  # names the folder; empty: programs are not kept
 ROOM = 2**30  # bytes in the folder, beyond which the least recently used files go
 AFTER = 0.8  # of the room, what is left then: so that not every new file makes a search
-CALLBACK = b"python_cpu_callback"  # in programs that call Python, which no other process can run
+CALLBACK = re.compile(rb"python_(cpu|gpu|tpu)?_?callback")  # in programs that call Python, as no other process can
+OURS = re.compile(r"[0-9a-f]{64}\.program|new-[\w-]+\.program")  # names of files that this module wrote
 _CHOSEN: list[Path | None] = []
 Options: TypeAlias = dict[str, bool | int]  # of the compiler
 
@@ -35,8 +43,9 @@ def keep_programs(folder: str | os.PathLike[str] | None) -> None:
     """Sets the folder that keeps programs compiled outside of jit for the next process; None: no folder.
 
     The default is the folder in the environment variable `JAXONOMY_DAE_CACHE` (empty: no folder), or else
-    `jaxonomy_dae` in the user's cache directory. A folder grows to 1 GiB; then the least recently used files are
-    deleted. You may delete it at any time. The files are executable code: use a folder in which only you may write.
+    `jaxonomy_dae` in the user's cache directory. The package's files in a folder, whose names end with `.program`, grow
+    to 1 GiB; then the least recently used ones are deleted. You may delete them at any time. They are executable code:
+    a folder that belongs to somebody else, or into which others may write, is not used, and `compilations()` says so.
     While JAX's own cache is on (`jax_compilation_cache_dir`), it is used instead.
     """
     _CHOSEN[:] = [None if folder is None else Path(folder).expanduser()]
@@ -54,7 +63,8 @@ def folder() -> Path | None:
     named = os.environ.get(VARIABLE)
     if named is not None:
         return Path(named).expanduser() if named else None
-    return _user_cache() / "jaxonomy_dae" / "programs"
+    caches = _user_cache()
+    return None if caches is None else caches / "jaxonomy_dae" / "programs"
 
 
 def folder_of(kind: str) -> Path | None:
@@ -64,15 +74,47 @@ def folder_of(kind: str) -> Path | None:
     named = os.environ.get(VARIABLE)
     if named is not None:
         return Path(named).expanduser() / kind if named else None
-    return _user_cache() / "jaxonomy_dae" / kind
+    caches = _user_cache()
+    return None if caches is None else caches / "jaxonomy_dae" / kind
 
 
-def _user_cache() -> Path:
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+def _user_cache() -> Path | None:
+    """The user's directory of caches; None for a user without a home, as in containers."""
+    try:
+        if sys.platform == "win32":
+            return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+        if sys.platform == "darwin":
+            return Path.home() / "Library" / "Caches"
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        return None
+
+
+_REFUSED: set[str] = set()  # folders of which a record was made
+
+
+def _usable(where: Path) -> bool:
+    """True if the folder is there, belongs to this user, and nobody else may write into it. Says once why not."""
+    try:
+        status = os.lstat(where)
+    except OSError:
+        return False
+    why = ""
+    if not stat.S_ISDIR(status.st_mode):
+        why = "it is not a folder, but a link or a file"
+    elif hasattr(os, "getuid") and status.st_uid != os.getuid():
+        why = "it belongs to another user"
+    elif hasattr(os, "getuid") and status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        why = "others may write into it"
+    if why and str(where) not in _REFUSED:
+        _REFUSED.add(str(where))
+        noted(Compilation("kept programs", "refused", f"the folder {where} is not used: {why}", 0.0, 0.0, 0.0))
+    return not why
+
+
+def calls_python(program: bytes) -> bool:
+    """True if a program, given as StableHLO, calls Python."""
+    return CALLBACK.search(program) is not None
 
 
 @functools.cache
@@ -96,6 +138,11 @@ def key(program: str) -> str | None:
     return hashlib.sha256(f"{program} {sorted(told.items())}".encode()).hexdigest()
 
 
+def _versions_of_backends() -> str:
+    """Of the driver and the plug-in of a GPU, too."""
+    return "; ".join(sorted({f"{d.platform} {d.client.platform_version}" for d in jax.devices(platform())}))
+
+
 def machine_and_versions() -> dict[str, str]:
     """What an executable of this process is made for, by what that is."""
     jaxlib = sys.modules.get("jaxlib")
@@ -103,29 +150,29 @@ def machine_and_versions() -> dict[str, str]:
         "version of JAX": jax.__version__,
         "version of jaxlib": getattr(jaxlib, "__version__", ""),
         "version of Python": ".".join(map(str, sys.version_info[:3])),
-        "backend": jax.default_backend(),
+        "backend": f"{platform()} {_versions_of_backends()}",
         "processor": _machine(),
     }
 
 
 def _path(key: str, options: Options) -> Path | None:
     where = folder()
-    return None if where is None else where / hashlib.sha256(f"{key} {sorted(options.items())}".encode()).hexdigest()
+    name = hashlib.sha256(f"{key} {sorted(options.items())}".encode()).hexdigest()
+    return None if where is None else where / f"{name}.program"
 
 
-def save(key: str | None, options: Options, run: Any, cost: float) -> None:
-    """Keeps an executable, and the processor seconds that it cost, if there is a folder for it. Nothing that goes wrong
-    here matters."""
+def save(key: str | None, options: Options, run: Any) -> None:
+    """Keeps an executable, if there is a folder for it. Nothing that goes wrong here matters."""
     path = None if key is None else _path(key, options)
     if path is not None:
         with contextlib.suppress(Exception):  # an executable that cannot be serialized
             content, _, _ = private("serialize_executable")(run)
-            _write(path, struct.pack("<d", cost) + zlib.compress(content, 1))
+            _write(path, zlib.compress(content, 1))
 
 
-def load(key: str | None, options: Options, outputs: int, arrays: Sequence[Any]) -> tuple[Any, float] | None:
-    """The executable that an earlier process has kept, and what it cost; None if there is none, or it is not whole.
-    It takes a list of such arrays, and returns a list of so many."""
+def load(key: str | None, options: Options, outputs: int, arrays: Sequence[Any]) -> Any:
+    """The executable that an earlier process has kept; None if there is none, or it is not whole. It takes a list of
+    such arrays, and returns a list of so many."""
     path = None if key is None else _path(key, options)
     content = None if path is None else _read(path)
     if path is None or content is None:
@@ -133,13 +180,12 @@ def load(key: str | None, options: Options, outputs: int, arrays: Sequence[Any])
     try:
         devices = sorted({d for a in arrays for d in a.sharding.device_set}, key=lambda d: d.id) or jax.devices()[:1]
         trees = jax.tree.structure(((list(arrays),), {})), jax.tree.structure([0] * outputs)
-        found = private("deserialize_executable")(zlib.decompress(content[8:]), *trees, execution_devices=devices)
+        return private("deserialize_executable")(zlib.decompress(content), *trees, execution_devices=devices)
     except MissingName:
         return None
-    except Exception:  # written by something else
+    except Exception:  # written by another version
         _delete(path)
         return None
-    return found, struct.unpack("<d", content[:8])[0]
 
 
 def save_record(key: str, content: bytes | None) -> None:
@@ -156,18 +202,35 @@ def load_record(key: str | None) -> bytes | None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    with contextlib.suppress(OSError):  # a full disk, no permission
+    """Writes a file as a whole, or not at all: other processes may write at the same time, and disks may be full."""
+    draft = None
+    try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix="new-", delete=False) as file:
+        if not _usable(path.parent):
+            return
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix="new-", suffix=".program", delete=False) as file:
+            draft = file.name
             file.write(hashlib.sha256(content).digest() + content)
-        os.replace(file.name, path)
+        os.replace(draft, path)
+        draft = None
         _make_room(path.parent)
+    except OSError:  # a full disk, no permission
+        pass
+    finally:
+        if draft is not None:
+            _delete(Path(draft))
 
 
 def _read(path: Path) -> bytes | None:
     """The content of a file; a file that is not whole is deleted."""
+    if not _usable(path.parent):
+        return None
     try:
-        whole = path.read_bytes()
+        opened = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0))
+        with open(opened, "rb") as file:
+            if hasattr(os, "getuid") and os.fstat(opened).st_uid != os.getuid():
+                return None
+            whole = file.read()
         os.utime(path)
     except OSError:
         return None
@@ -183,12 +246,13 @@ def _delete(path: Path) -> None:
 
 
 def _make_room(where: Path) -> None:
-    """Deletes the files that were used least recently, if all together take more than the room."""
+    """Deletes the package's files that were used least recently, if all together take more than the room."""
     files = []
     for entry in os.scandir(where):
-        with contextlib.suppress(OSError):
-            status = entry.stat()
-            files.append((status.st_mtime, status.st_size, entry.path))
+        if OURS.fullmatch(entry.name):
+            with contextlib.suppress(OSError):
+                status = entry.stat(follow_symlinks=False)
+                files.append((status.st_mtime, status.st_size, entry.path))
     taken = sum(size for _, size, _ in files)
     if taken <= ROOM:
         return

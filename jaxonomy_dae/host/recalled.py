@@ -2,55 +2,37 @@
 and the functions outside of XLA that it calls."""
 
 import functools
-import io
-import pickle
 import re
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import PyTreeDef
 
 from ..base.aliases import PyTree
+from .written import NotData, read, written
 
 
 def record(program: str, calls: list[str], outcome: PyTree) -> bytes | None:
-    """The digest of a program's text, what it calls, and what its outcome is beside arrays, in bytes; None if reading
+    """The digest of a program's text, what it calls, and what its outcome is beside arrays, as data; None if reading
     would not give the same."""
     try:
-        content = _written((program, calls, outcome))
-        return content if _written(pickle.loads(content)) == content else None
-    except Exception:  # whatever classes of the user's own raise
+        content = written((program, calls, outcome))
+        return content if written(read(content)) == content else None
+    except NotData:
         return None
 
 
 def recalled(content: bytes) -> tuple[str, list[str], PyTree] | None:
     """What `record` wrote; None if it cannot be read."""
     try:
-        return pickle.loads(content)
-    except Exception:  # written by something else
+        program, calls, outcome = read(content)
+        structure, fixed, is_array = outcome
+        whole = isinstance(program, str) and all(isinstance(call, str) for call in calls)
+        whole = whole and structure.num_leaves == len(fixed) == len(is_array)
+        return (program, calls, outcome) if whole else None
+    except (NotData, TypeError, ValueError, AttributeError):  # written by something else
         return None
-
-
-class _Pickler(pickle.Pickler):
-    """Writes structures of pytrees, too; and the same bytes for what is equal."""
-
-    def __init__(self, file: io.BytesIO):
-        super().__init__(file)
-        self.fast = True  # without remembering which parts are one object
-
-    def reducer_override(self, part: Any) -> Any:
-        if isinstance(part, PyTreeDef):
-            return jax.tree.structure, (jax.tree.unflatten(part, [0] * part.num_leaves),)
-        return NotImplemented
-
-
-def _written(part: object) -> bytes:
-    file = io.BytesIO()
-    _Pickler(file).dump(part)
-    return file.getvalue()
 
 
 # By parts of the names of what programs call: what makes it known to a fresh process, which crashes otherwise. Modules

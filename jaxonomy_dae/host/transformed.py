@@ -7,8 +7,9 @@ mode it is one, and a batch of it for the directions of `jax.jacfwd`. Whatever e
 on several devices, `jax.debug_nans`), JAX transforms the function.
 """
 
+import dataclasses
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,61 +21,76 @@ from jax.custom_derivatives import SymbolicZero
 
 from ..base.aliases import PyTree
 from ..base.private_names import MissingName, clear_jitted, private
+from .program import Program
 from .staging import is_staged, is_traced, kind, layers
-from .tiers import Program
 from .whole_records import WHOLE, numbered, whole_records
+
+Traceable: TypeAlias = Callable[[list[PyTree]], PyTree]
 
 
 class Function:
-    """`function(arrays)`, which returns any pytree, for arrays of certain shapes.
+    """A function of arrays of certain shapes that returns any pytree. Each call brings the function: it is traced where
+    something of it is not compiled yet, and not held afterwards, with all that it closes over.
 
     - `name`: what profiles and records show; `why`: what made it necessary.
-    - `runs_once`: its runs are expected to take less time than its compilation does.
-    - `identity`: a digest of what it computes, the same in every process (`lasting.py`); None if it has none.
+    - `optimize`: whether it is compiled with all optimizations.
+    - `identity`: a digest of what it computes, the same in every process (`cache.py`); None if it has none.
     """
 
-    def __init__(
-        self,
-        function: Callable[[list[PyTree]], PyTree],
-        name: str,
-        why: str,
-        runs_once: bool,
-        identity: str | None = None,
-    ):
-        def run(arrays: list[Array]) -> PyTree:
-            return function(arrays)
-
-        run.__name__ = run.__qualname__ = name
-        self.function, self.name, self.why, self.runs_once, self.identity = function, name, why, runs_once, identity
-        self._transformed: Any = eqx.filter_jit(run)  # for what JAX transforms
+    def __init__(self, name: str, why: str, optimize: bool, identity: str | None = None):
+        self.name, self.why, self.optimize, self.identity = name, why, optimize, identity
+        self._transformed: Any = None  # for what JAX transforms
+        self._held: list[Traceable] = []  # while `_transformed` is called
         self._program: Program | None = None
         self._derived: dict[Hashable, Function] = {}
         self.known = 0  # of `_pushed`: the first so many arrays are not directions
         self.pulls = False  # a part of a derivative in reverse mode: what is derived from it has no identity
 
-    def __call__(self, arrays: list[Any]) -> PyTree:
+    def __call__(self, function: Traceable, arrays: list[Any]) -> PyTree:
         arrays = [a if isinstance(a, jax.Array) else jax.device_put(a) for a in arrays]  # JAX' own kind of float
         work = _at_work(arrays)
         if work == "LinearizeTracer":
-            return self._differentiated(arrays)
+            return self._differentiated(function, arrays)
         if work == "JVPTracer":
-            return self._pushed(arrays)
+            return self._pushed(function, arrays)
         if work == "BatchTracer":
-            return self._batched(arrays)
+            return self._batched(function, arrays)
         if work or not _is_plain(arrays):
-            return self._transformed(arrays)
+            return self._by_jax(function, arrays)
         if self._program is None:
-            self._program = Program(self.function, arrays, self.name, self.why, self.runs_once, self.identity)
-        return self._program(arrays) if self._program.stands_alone else self._transformed(arrays)
+            self._program = Program(function, arrays, self.name, self.why, self.optimize, self.identity)
+        if self._program.stands_alone:
+            return self._program(arrays, function)
+        return self._by_jax(function, arrays)
 
-    def regained(self) -> Any:
+    @property
+    def text(self) -> str | None:
+        """A digest of the program that was compiled; None if there is none."""
+        return getattr(self._program, "text", None)
+
+    def _by_jax(self, function: Traceable, arrays: list[Array]) -> PyTree:
+        """The outcome of a program that JAX makes, keeps and transforms."""
+        if self._transformed is None:
+
+            def run(arrays: list[Array]) -> PyTree:
+                return self._held[-1](arrays)
+
+            run.__name__ = run.__qualname__ = self.name
+            self._transformed = eqx.filter_jit(run)
+        self._held.append(function)
+        try:
+            return self._transformed(arrays)
+        finally:
+            self._held.pop()
+
+    def regained(self, function: Traceable) -> Any:
         """The structure of the pullback that belongs to what a program from an earlier process returned.
 
         **Raises:**
 
         - `LostStructure` if that program would be another one now.
         """
-        outcome = None if self._program is None else self._program.restaged()
+        outcome = None if self._program is None else self._program.restaged(function)
         if outcome is None:
             raise LostStructure
         structure, fixed, _ = outcome
@@ -86,39 +102,39 @@ class Function:
 
     def clear(self) -> None:
         """Frees what was compiled."""
-        clear_jitted(self._transformed)
+        if self._transformed is not None:
+            clear_jitted(self._transformed)
         self._program = None
         for one in self._derived.values():
             one.clear()
         self._derived.clear()
 
-    def _derive(
-        self, key: Hashable, function: Callable[[list[PyTree]], PyTree], name: str, told: str | None = None
-    ) -> "Function":
+    def _derive(self, key: Hashable, name: str, told: str | None = None) -> "Function":
         """The derivative or batch of this key; in all processes, `told` tells it from others of this function."""
         if key not in self._derived:
             identity = None if told is None or self.identity is None or self.pulls else f"{self.identity} {told}"
-            self._derived[key] = Function(function, name, self.why, self.runs_once, identity)
+            self._derived[key] = Function(name, self.why, self.optimize, identity)
         return self._derived[key]
 
-    def _differentiated(self, arrays: list[Array]) -> PyTree:
+    def _differentiated(self, function: Traceable, arrays: list[Array]) -> PyTree:
         """The outcome in reverse mode, with respect to the arrays that are traced."""
         chosen = tuple(
             k for k, a in enumerate(arrays) if is_traced(a) and jnp.issubdtype(a.dtype, jnp.inexact)
         )  # fmt: skip
-        values = self._derive(
-            ("values", chosen), lambda arrays: _values(self.function, chosen, arrays), self.name, f"values {chosen}"
-        )
+        values = self._derive(("values", chosen), self.name, f"values {chosen}")
         values.pulls = True
         shape: list[PyTree] = []  # what the outcome is, beside its arrays
 
+        def valued(arrays: list[Array]) -> PyTree:
+            return _values(function, chosen, arrays)
+
         @jax.custom_vjp
         def call(*arrays: Array) -> PyTree:
-            return values([*arrays])[0]
+            return values(valued, [*arrays])[0]
 
         def forward(*given: PyTree) -> PyTree:
             known = [one.value for one in given]
-            smooth, rest, pullback = values(known)
+            smooth, rest, pullback = values(valued, known)
             shape[:] = [rest]
             return smooth, (pullback, known if pullback.structure.value is None else [])
 
@@ -128,7 +144,7 @@ class Function:
                 return pulled_through(pullback, cotangents)
             except LostStructure:
                 values.forget()
-                return pulled_through(values(known)[2], cotangents)
+                return pulled_through(values(valued, known)[2], cotangents)
 
         def pulled_through(residuals: "_Pullback", cotangents: list[PyTree]) -> PyTree:
             # JAX would make arrays of zeros for what is not read, by a program for each shape.
@@ -142,7 +158,7 @@ class Function:
                     return pulled_back(arrays)
 
             def pulled_back(arrays: list[Array]) -> list[PyTree]:
-                whole_structure = values.regained() if structure.value is None else structure.value
+                whole_structure = values.regained(valued) if structure.value is None else structure.value
                 pullback = jax.tree.unflatten(whole_structure, arrays[:n])
 
                 def pulled_by(zeros: list[PyTree]) -> list[PyTree]:
@@ -156,17 +172,17 @@ class Function:
 
             values.pulls = False
             transpose = values._derive(
-                ("pullback", read, structure, whole), pulled, f"gradient of {self.name}", f"pullback {read} {whole}"
+                ("pullback", read, structure, whole), f"gradient of {self.name}", f"pullback {read} {whole}"
             )
             values.pulls = transpose.pulls = True
-            found = iter(transpose([*leaves, *(c for c, r in zip(cotangents, read, strict=True) if r)]))
+            found = iter(transpose(pulled, [*leaves, *(c for c, r in zip(cotangents, read, strict=True) if r)]))
             return tuple(next(found) if k in chosen else None for k in range(len(arrays)))
 
         call.defvjp(forward, backward, symbolic_zeros=True)
         smooth = call(*arrays)
         return _combined(smooth, shape[0])
 
-    def _pushed(self, arrays: list[Array]) -> PyTree:
+    def _pushed(self, function: Traceable, arrays: list[Array]) -> PyTree:
         """The outcome in forward mode, with respect to the arrays that are traced."""
         chosen = tuple(k for k, a in enumerate(arrays) if is_traced(a))
         n = len(arrays)
@@ -179,7 +195,7 @@ class Function:
                 given = list(arrays[:n])
                 for k, value in zip(chosen, moved, strict=True):
                     given[k] = value
-                smooth, rest = eqx.partition(self.function(given), eqx.is_inexact_array)
+                smooth, rest = eqx.partition(function(given), eqx.is_inexact_array)
                 others, fixed = eqx.partition(rest, eqx.is_array)
                 split[:] = [jax.tree.structure(smooth), fixed]
                 return jax.tree.leaves(smooth), others
@@ -188,9 +204,7 @@ class Function:
             structure, fixed = split
             return (smooth, (_Static(structure), eqx.combine(others, fixed))), slopes
 
-        pushed = self._derive(
-            ("tangents", chosen), along, f"derivative of {self.name}", f"tangents {chosen}"
-        )  # fmt: skip
+        pushed = self._derive(("tangents", chosen), f"derivative of {self.name}", f"tangents {chosen}")
         pushed.known = n
         rest: list[PyTree] = []
 
@@ -203,13 +217,13 @@ class Function:
             given = list(arrays)
             for k, value in zip(chosen, moved, strict=True):
                 given[k] = value
-            (smooth, rest[:]), slopes = pushed([*given, *tangents])
+            (smooth, rest[:]), slopes = pushed(along, [*given, *tangents])
             return smooth, slopes
 
         smooth = call(*(arrays[k] for k in chosen))
         return _combined(smooth, (rest[0], rest[1]))
 
-    def _batched(self, arrays: list[Any]) -> Any:
+    def _batched(self, function: Traceable, arrays: list[Any]) -> Any:
         """The outcome under one `jax.vmap` of known values."""
         axes = [getattr(a, "batch_dim", None) for a in arrays]
         values = [[*layers(a)][-1] for a in arrays]
@@ -223,7 +237,7 @@ class Function:
             fixed: list[PyTree] = []
 
             def one(*arrays: Array) -> PyTree:
-                moving, rest = eqx.partition(self.function([*arrays]), eqx.is_array)
+                moving, rest = eqx.partition(function([*arrays]), eqx.is_array)
                 fixed[:] = [rest]
                 return moving
 
@@ -233,7 +247,7 @@ class Function:
             return moving, fixed[0]
 
         told = f"batch {size} {axes} {self.known}"
-        moving, rest = self._derive(("batch", size, tuple(axes)), many, f"batch of {self.name}", told)(values)
+        moving, rest = self._derive(("batch", size, tuple(axes)), f"batch of {self.name}", told)(many, values)
         differs = jax.tree.map(lambda rows: True, moving)
         if alike:
             differs = (jax.tree.map(lambda value: False, moving[0]), differs[1])
@@ -254,11 +268,11 @@ class LostStructure(Exception):
     """The structure of a pullback is needed, and the program that made its arrays cannot be traced again."""
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class _Structure:
     """The structure of a pullback: programs, which are not written to files. There, `value` is None."""
 
-    def __init__(self, value: Any = None):
-        self.value = value
+    value: Any = None
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Structure) and self.value == other.value
@@ -266,8 +280,9 @@ class _Structure:
     def __hash__(self) -> int:
         return hash(self.value)
 
-    def __reduce__(self):
-        return _Structure, ()
+    def as_data(self) -> "_Structure":
+        """What is written of it."""
+        return _Structure()
 
 
 class _Pullback(eqx.Module):

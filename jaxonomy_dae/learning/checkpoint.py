@@ -3,13 +3,9 @@
 The arrays are Equinox's (`tree_serialise_leaves`), bit for bit.
 """
 
-import dataclasses
-import functools
 import hashlib
 import json
 import os
-import re
-import types
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -37,58 +33,6 @@ def fingerprint(tree: PyTree) -> str:
         else:
             found.update(repr(leaf).encode())
     return found.hexdigest()
-
-
-def described(value: object, inside: tuple[object, ...] = ()) -> Described:
-    """Nested lists of texts that say which functions and settings a value consists of, alike in every process: a
-    function by its code, by what it closes over and by the numbers that it reads from its module; a module by its class
-    and fields. `inside` are the functions that the value belongs to, which may refer to themselves."""
-    if isinstance(value, dict):
-        return [[str(key), described(one, inside)] for key, one in value.items()]
-    if isinstance(value, list | tuple):
-        return [described(one, inside) for one in value]
-    if isinstance(value, functools.partial):
-        return ["partial", described([value.func, value.args, value.keywords], inside)]
-    if isinstance(value, types.MethodType):
-        return ["method", described([value.__func__, value.__self__], inside)]
-    if isinstance(value, types.FunctionType):
-        name = [value.__module__, value.__qualname__]
-        if any(value is one for one in inside):
-            return name
-        names = value.__code__.co_names
-        read = {n: value.__globals__[n] for n in names if isinstance(value.__globals__.get(n), _NUMBERS)}
-        given = [value.__defaults__, value.__kwdefaults__, [_content(c) for c in value.__closure__ or ()], read]
-        return [*name, _code(value.__code__), described(given, (*inside, value))]
-    if isinstance(value, type):
-        return f"{value.__module__}.{value.__qualname__}"
-    if eqx.is_array(value) or isinstance(value, np.ndarray):
-        return fingerprint(value)
-    if dataclasses.is_dataclass(value):
-        fields = {f.name: getattr(value, f.name, None) for f in dataclasses.fields(value)}
-        return [described(type(value)), described(fields, inside)]
-    wrapped = getattr(value, "__wrapped__", None)  # such as of what `jax.jit` returns
-    if wrapped is not None:
-        return described(wrapped, inside)
-    return _ADDRESS.sub("", repr(value))
-
-
-_ADDRESS = re.compile(r" at 0x[0-9a-f]+")
-_NUMBERS = (bool, int, float, complex, str, np.ndarray, np.generic, jax.Array)
-
-
-def _content(cell: types.CellType) -> object:
-    try:
-        return cell.cell_contents
-    except ValueError:  # not yet filled
-        return None
-
-
-def _code(code: types.CodeType) -> list[Described]:
-    constants = [
-        _code(c) if isinstance(c, types.CodeType) else sorted(map(repr, c)) if isinstance(c, frozenset) else repr(c)
-        for c in code.co_consts
-    ]
-    return [code.co_code.hex(), list(code.co_names), constants]
 
 
 def save(path: str | Path, facts: Mapping[str, Described], state: PyTree) -> None:

@@ -15,8 +15,9 @@ from jaxtyping import Float
 from ..base.aliases import PyTree
 from ..base.errors import ModelError, SimulationError, whole_number
 from ..base.optional import Axes, new_axes
+from ..host.content import content
 from .beginnings import silent
-from .checkpoint import Described, described, fingerprint, read_facts, read_state, save
+from .checkpoint import Described, fingerprint, read_facts, read_state, save
 from .evaluation import Evaluation, Weights
 from .gradient import Batches
 from .objective import Objective
@@ -256,17 +257,17 @@ def _facts(objective: Objective, plan: GradientSteps, optimizer: optax.OptState)
         repr(s.starts),
     ]
     searched = [np.array(objective.free), c.low, c.high, c.start[~objective.free], c.size, c.spread, c.centre, c.shifts]
-    functions = [objective.system.neural, objective.observers]
+    functions = eqx.partition((objective.system.neural, objective.observers), eqx.is_array)[1]
     return {
-        "model": objective.system.plan.digest,
+        "model": content(objective.system.plan).digest,
         "set of unknowns": json.dumps(
             [list(c.names), fingerprint(searched), sorted(map(str, objective.penalties.items()))]
         ),
         "set of values": fingerprint(eqx.filter((objective.system, objective.observers), eqx.is_array)),
-        "set of networks and sensor laws": fingerprint(described(functions)),
+        "set of networks and sensor laws": content(*jax.tree.flatten(functions)).digest,
         "set of data": fingerprint(data),
         "kind of inputs": [list(pair) for pair in s.kinds],
-        "integration": fingerprint(described(dict(objective.layout.options))),
+        "integration": content(dict(objective.layout.options)).digest,
         "precision": str(objective.system.parameters.values.dtype),
         "optimizer": str(jax.tree.structure(optimizer)),
         "batch": plan.batch,

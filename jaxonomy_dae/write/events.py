@@ -100,6 +100,8 @@ class HeldBranch:
     - `levels`: the hidden variables that equal the branch and its derivatives below the highest; zero while it holds.
     - `active`: the hidden variable that is 1 while the branch holds, and 0 otherwise.
     - `impulse`: the discrete variable that an event sets to 1 to let an impulse act.
+    - `rate`: the discrete variable that is added to the highest derivative of the branch: zero, but the tangent along
+        which an impulse acts.
     - A branch that only pushes also has the hidden variable of its force, and the discrete variable that lets go at 0.
     """
 
@@ -107,6 +109,7 @@ class HeldBranch:
     levels: tuple[str, ...]
     active: str
     impulse: RelationSymbol
+    rate: RelationSymbol
     force: str | None = None
     closed: DiscreteSymbol | None = None
 

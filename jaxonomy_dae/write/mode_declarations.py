@@ -125,18 +125,19 @@ class ModeDeclarations(RelationDeclarations):
         levels = [then]
         for _ in range(order):
             levels.append(der(levels[-1]))
-        impulse = self._hidden_discrete(0.0)
+        impulse, rate = self._hidden_discrete(0.0), self._hidden_discrete(0.0)
         *zero, top = levels
         number = len(self.held_branches)
         asked: Condition = sympy.Ne(impulse, 0)
         acts = sympy.Or(condition, asked)
-        self.add_equations(sympy.Piecewise((top + impulse * zero[-1], acts), (otherwise, True)))
+        self.add_equations(sympy.Piecewise((top + rate, acts), (otherwise, True)))
         self.held_branches.append(
             HeldBranch(
                 f"{then} = 0 while {condition}",
                 tuple(self._hidden(f":held[{number},{k}]", level) for k, level in enumerate(zero)),
                 self._hidden(f":held[{number}]", sympy.Piecewise((1, condition), (0, True))),
                 impulse,
+                rate,
                 None if pushes is None else self._hidden(f":held[{number},force]", otherwise),
                 pushes,
             )

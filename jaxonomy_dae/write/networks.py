@@ -1,6 +1,7 @@
 """Networks and functions of the user's: their numbers as arrays, how many outputs they have, of which kind they are;
 and why JAX cannot trace one."""
 
+import types
 from collections.abc import Callable
 from typing import Any
 
@@ -91,7 +92,26 @@ class OfScalars(eqx.Module):
 
 def of_scalars(function: Callable) -> OfScalars:
     """`function(x, y, …) -> scalar or (outputs,)` as a module; NumPy arrays in it become JAX arrays."""
-    return OfScalars(jax.tree.map(_on_device, function))
+    return OfScalars(jax.tree.map(lambda leaf: _compared_as_object(_on_device(leaf)), function))
+
+
+class OneObject:
+    """A callable object that is equal to itself alone. JAX compares what is static, and an object that says itself what
+    it is equal to, as a dataclass does, may have no hash, or leave out what its calls depend on."""
+
+    def __init__(self, function: Callable):
+        self.function = function
+
+    def __call__(self, *args: Any) -> Any:
+        return self.function(*args)
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+
+def _compared_as_object(leaf: PyTree) -> PyTree:
+    own = callable(leaf) and not eqx.is_array(leaf) and type(leaf).__eq__ is not object.__eq__
+    return OneObject(leaf) if own and not isinstance(leaf, types.MethodType) else leaf
 
 
 def uses_numpy(error: Exception) -> bool:

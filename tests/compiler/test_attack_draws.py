@@ -34,10 +34,11 @@ def test_what_cannot_be_meant(capsys, given, said):
 
 
 @pytest.mark.parametrize("given", [[], ["MINUTES="]])
-def test_no_time_is_given(given):
+@pytest.mark.parametrize("goal, minutes", [("attack", 10), ("test-slow", 25)])
+def test_no_time_is_given(goal, minutes, given):
     outside = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
-    run = subprocess.run(["make", "-n", "attack", *given], cwd=ROOT, env=outside, capture_output=True, text=True)
-    assert run.returncode and "how many minutes? make attack MINUTES=10" in run.stderr and not run.stdout
+    run = subprocess.run(["make", "-n", goal, *given], cwd=ROOT, env=outside, capture_output=True, text=True)
+    assert run.returncode and f"how many minutes? make {goal} MINUTES={minutes}" in run.stderr and not run.stdout
 
 
 def test_all_families_take_turns():

@@ -20,7 +20,8 @@ def public_names() -> list[str]:
     found = []
     for name in ("", *MODULES):
         module = importlib.import_module(f"jaxonomy_dae.{name}".rstrip("."))
-        text = pathlib.Path(module.__file__ or "").read_text()
+        file = pathlib.Path(module.__file__ or "")
+        text = (file if name else file.with_name("names.py")).read_text()
         own = re.findall(r"^from .* as (\w+)$", text, re.M) or re.findall(r"^def ([a-z]\w*)", text, re.M)
         found += [f"{module.__name__}.{n}" for n in own]
     return found
@@ -155,6 +156,8 @@ def test_the_gallery_has_an_overview():
         assert re.search(rf"### \[[^\]]+\]\([./]*{entry.stem}\.ipynb\)\n\n[^\n]+\.", text), entry.stem
         suffix, figure = gallery.last_figure_of(entry.path)
         assert f"({entry.stem}.{suffix})" in text and "TIME" not in text
+        file = gallery.colab_button(entry).partition("/blob/main/")[2].partition(")")[0]
+        assert (gallery.EXAMPLES.parent / file) == entry.path and gallery.colab_button(entry) in text
         assert b"<svg" in figure if suffix == "svg" else figure.startswith(b"\x89PNG")
     found = {path.stem for path in (gallery.EXAMPLES / "gallery").glob("*.ipynb")} | {"neural_dae_pendulum_drag"}
     assert found == {entry.stem for entry in gallery.entries()}

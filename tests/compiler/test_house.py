@@ -18,14 +18,17 @@ ORDER = [
     "solve/linear", "solve/adjoint", "solve/methods", "solve/events",
     "compile/model", "compile/diagnosis", "compile/passes", "compile/lowering",
     "run/system", "run/start", "run/simulation",
-    "learning", "analysis", "plotting", "testing", "library", "modelica",
+    "learning", "analysis", "plotting", "testing", "library", "modelica", "fmi",
 ]  # fmt: skip
-FACES = {"__init__", "errors", "linear", "solvers"}  # public names of the rooms below, under short paths
+FACES = {"__init__", "names", "errors", "linear", "solvers"}  # public names of the rooms below, under short paths
 # Methods that hand over to a room above their own, when they are called.
-DEFERRED = {("run/system", "run/start"), ("run/simulation", "plotting"), ("analysis", "plotting")}
+DEFERRED = {
+    ("run/system", "run/start"), ("run/simulation", "plotting"), ("analysis", "plotting"), ("run/system", "fmi"),
+}  # fmt: skip
 # Imports inside a function, or for types alone, that close a circle of modules; and why they are there. Patterns stand
 # for several modules.
 CLOSING = {
+    ("run/system/system", "fmi/export"): "a method of a system writes it as an FMU",
     ("run/simulation/solution", "run/simulation/energy_balance"): "the balance of a solution is that of a second run",
     ("learning/*", "learning/estimate"): "an estimate's methods call the modules that read it",
     ("learning/estimate", "learning/problem"): "a problem makes the estimates that know it",

@@ -115,6 +115,7 @@ print(len(texts), texts[0])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "what, adjoints",
     [

@@ -38,6 +38,7 @@ def test_other_roundings_do_not_decide(name, mode):
     assert {verdict(model.make(), mode, seed) for seed in range(1, 6)} == {model.expected}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kernel", ["Haswell", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Nehalem", "Zen", "Sandybridge"))]
 )

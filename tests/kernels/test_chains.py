@@ -36,6 +36,7 @@ def by_name(system, array, n):
     return np.asarray(array)[..., [place[f"c.f{k}.x"] for k in range(n)]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
     [pytest.param(lambda u: u, marks=pytest.mark.slow), lambda u: u / (1 + u**2)],

@@ -94,7 +94,7 @@ def test_what_is_absent_is_not_evaluated():
 INNER = {"v_s": (0.01, 2.0), "p": (0.5, 3.0)}
 
 
-@pytest.mark.long("small programs for three points")
+@pytest.mark.slow
 def test_numbers_inside_terms():
     """Only combinations of known functions could be found: a width or an exponent had to be guessed beforehand."""
     library = terms("v", "tanh(v/v_s)", "sign(v)*Abs(v)**p", "v*exp(-(v/v_s)**2)", **INNER)

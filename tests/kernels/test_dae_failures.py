@@ -59,7 +59,7 @@ def solve_chosen(which, solver, y0=(ONE, ONE), **options):
     return solve_dae(CHOSEN, 2.0, y0, ts=TS, solver=solver, names=NAMES, max_steps=1000, args=which, **options)
 
 
-@pytest.mark.long("compiles the program that the tests beside it share")
+@pytest.mark.slow
 @ALSO_RODAS5P
 @pytest.mark.parametrize("end", ENDS)
 def test_an_end_of_the_solution_is_reported(end, solver):
@@ -309,6 +309,7 @@ def test_max_order_is_checked():
         BDF(max_order=6)
 
 
+@pytest.mark.slow
 def test_bdf_needs_tolerances_outside_of_diffrax():
     solver = BDF()
     state = solver.init(TERM, jnp.asarray(0.0), jnp.asarray(0.1), GOOD, None)

@@ -67,7 +67,7 @@ def test_projection_keeps_hidden_constraints(solver):
 # --- published values ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.long("BDF against published values: one program")
+@pytest.mark.slow
 @ALSO_RODAS5P
 def test_robertson_over_eleven_decades(solver):
     problem = PROBLEMS["robertson"]
@@ -213,7 +213,7 @@ class Program:
 program = functools.cache(Program)
 
 
-@pytest.mark.long("compiles the program that the tests beside it share")
+@pytest.mark.slow
 @ALSO_BDF
 def test_jumps_that_are_named_cost_less(solver):
     ts = np.linspace(0.0, 1.0, 101)
@@ -229,6 +229,7 @@ def test_jumps_that_are_named_cost_less(solver):
     assert np.abs(np.asarray(x)[:, 0] - exact).max() > 1e-4 or untold > told + 5 or not okay
 
 
+@pytest.mark.slow
 @ALSO_BDF
 def test_there_and_back(solver):
     (x, z), _, _ = program(solver)(CIRCLE, np.linspace(0.0, 6.0, 101), 1e-8)

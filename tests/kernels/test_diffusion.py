@@ -10,6 +10,7 @@ from kalman import discretized, held
 from jaxonomy_dae.learning.linear_models import affine_flow, linear_flow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n, h", [(1, 0.3), (3, 0.7), (4, 5.0)])
 def test_against_exponentials(n, h):
     rng = np.random.default_rng(n)

@@ -85,6 +85,7 @@ def test_the_derivative_is_the_saltation_matrix():
         np.testing.assert_allclose(jacobians[k], np.vstack([saltation, time]), rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_refused():
     """The map at an event has the flow's first derivative only."""
     numbers, x = random_problem(0)

@@ -72,7 +72,7 @@ def series(value, slope, u):
     return np.array([value, slope * u[1], slope * u[2] - value * u[1] ** 2 / 2])
 
 
-@pytest.mark.long("second derivatives of expressions that share nothing")
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [8, pytest.param(20, marks=pytest.mark.slow)])
 def test_branches_not_taken_are_never_seen(count):
     """Random nested branches whose untaken side is not real: first and second derivatives, forward and reverse."""
@@ -147,7 +147,7 @@ FINITE_EVERYWHERE = {
 }
 
 
-@pytest.mark.long("fourteen functions with two derivatives, forward and in reverse")
+@pytest.mark.slow
 def test_what_is_finite_though_its_parts_overflow():
     """Value, slope and curvature where exp(x) is beyond the largest number, by symbols, forward and in reverse."""
     nodes = [graph(expression) for expression in FINITE_EVERYWHERE.values()]
@@ -220,6 +220,7 @@ def test_a_table_in_an_equation():
     assert any(np.allclose(g, [-1.5, -0.5, 0.0]) for g in leaves)
 
 
+@pytest.mark.slow
 def test_functions_in_a_constraint_differentiated_twice():
     """Two outputs of one function in a constraint of index 3, against its derivatives by JAX."""
     radii = np.array([1.0, 0.8])  # a constant in a closure

@@ -228,6 +228,7 @@ def test_conditions_that_mix_time_and_variables():
         assert float(at(t, x)) == y
 
 
+@pytest.mark.slow
 def test_a_negative_base_is_not_a_number():
     """A fractional power of a negative number is NaN, at compile time too, where the test points are negative."""
 

@@ -75,7 +75,7 @@ def _found(solver, batched):
     return {case: (value, dict(zip(NAMES, by, strict=True))) for case, (value, by) in zip(CASES, rows, strict=True)}
 
 
-@pytest.mark.long("the gradient that all cases share is compiled")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
     [None, *(pytest.param(s, marks=pytest.mark.slow) for s in (diffrax.Tsit5(), diffrax.Dopri5()))],
@@ -97,6 +97,7 @@ def test_in_batches():
             assert abs(by["x0"] - np.cos(OMEGA)) < RESOLVED
 
 
+@pytest.mark.slow
 def test_beside_what_moves():
     """The steps of what moves evenly grow without limit, too."""
     assert abs(found()["beside motion"][1]["x0"] - np.cos(OMEGA)) < RESOLVED
@@ -157,6 +158,7 @@ def test_damped_motion():
     assert abs(found()["damped"][1]["d"] - expected) < 1e-7
 
 
+@pytest.mark.slow
 def test_without_differentiation_steps_grow():
     """Nothing is held back where no derivative is asked for."""
     assert int(jax.jit(lambda p: solve(p, rtol=1e-6, atol=1e-8).stats["num_steps"])(at())) < 20
@@ -244,7 +246,7 @@ def beside_a_ramp(way):
     return float(jax.jit(by(end))(jnp.zeros(())))
 
 
-@pytest.mark.long("a gradient by each adjoint is compiled")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "way",
     ["forward", *(pytest.param(w, marks=pytest.mark.slow) for w in ("checkpoint", "a controller that grows slowly"))],
@@ -254,7 +256,7 @@ def test_every_adjoint_and_controller(way):
     assert abs(beside_a_ramp(way) - np.cos(OMEGA)) < RESOLVED
 
 
-@pytest.mark.long("a gradient is compiled")
+@pytest.mark.slow
 def test_a_record_that_is_too_large(monkeypatch):
     """Kind: what one adjoint minds and the one that takes its place does not. Where the record of `StoredAdjoint` would
     be too large, steps were not held back, and ∂x(1)/∂x(0) at rest was −0.729 in place of 0.408."""

@@ -257,7 +257,7 @@ def test_what_is_undone_at_zero_may_happen_later():
     assert state.q[:2].tolist() == [1.0, 0.0] and state.armed[1] == RESTS
 
 
-@pytest.mark.long("the gradient that all problems share is compiled")
+@pytest.mark.slow
 def test_a_ball():
     ran, by, _ = found("ball")
     assert ran.result == OKAY and ran.count == 6

@@ -156,7 +156,7 @@ def test_what_ran_before_changes_nothing(name):
                 np.testing.assert_array_equal(got, wanted)
 
 
-@pytest.mark.long("runs two programs of an explicit and an implicit solver")
+@pytest.mark.slow
 def test_the_choice_of_a_solver_is_no_other_models():
     """The explicit solver that a slow model chose inside `jax.jit` was taken for a stiff one of equal structure, which
     failed after 16,384 steps."""

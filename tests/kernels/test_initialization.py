@@ -107,6 +107,7 @@ def started(system, initial):
     return lambda *names: [found[name] for name in names]
 
 
+@pytest.mark.slow
 def test_a_fixed_start_of_an_algebraic_variable_holds(declared):
     # 2³ + 2 = 10; Newton to rounding
     np.testing.assert_allclose(declared("fixed.x", "fixed.y"), [2.0, 10.0], rtol=1e-12)
@@ -176,6 +177,7 @@ def test_contradiction_inside_jit():
         jax.block_until_ready(jax.jit(lambda: system.initialize(throw=True))())
 
 
+@pytest.mark.slow
 def test_values_given_outrank_declared_starts(given):
     np.testing.assert_allclose(given("x.x", "x.y"), [1.0, 2.0], rtol=1e-12)
     np.testing.assert_allclose(given("y.x", "y.y"), [3.0, 30.0], rtol=1e-12)
@@ -228,6 +230,7 @@ class TwoBranches(Component):
         self.add_equations(Eq(a, -2 * b), Eq(a**2, 4 + z), Eq(der(z), 1))
 
 
+@pytest.mark.slow
 def test_guesses_that_differ():
     """The one that says more counts; not a model of the same structure that came before, with other values."""
     for first, second, expected in ((0.0, 1.5, -2.0), (3.0, 0.0, 2.0), (0.0, -1.5, 2.0), (0.0, 1.5, -2.0)):
@@ -273,7 +276,7 @@ class Drains(Component):
 
 
 @pytest.mark.parametrize("asked", [False, True])
-@pytest.mark.parametrize("c", [0.0, 0.3])
+@pytest.mark.parametrize("c", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("starts, x", [({"x": 0.5, "y": 0.7}, 0.5), ({"x": None, "y": 0.7}, None)])
 def test_what_is_asked_does_not_move_the_start(starts, x, c, asked):
     """What is asked: with an output der(y), y was a state or could be one, and its guess counted as much as that of x,
@@ -296,6 +299,7 @@ class Coupled(Component):
         self.add_equations(Eq(der(x), f - x), Eq(der(y), -2 * y - f), Eq(x - 2 * y, 1))
 
 
+@pytest.mark.slow
 def test_guesses_of_what_is_no_state_count_as_much():
     """The order of declaration: the first of two variables became the state, and its guess held; the other's did not
     count. Now the point is the nearest to both."""

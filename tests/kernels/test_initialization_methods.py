@@ -163,6 +163,7 @@ def test_a_start_that_is_not_finite_is_given_up_at_once():
     assert used == METHODS[-1] and x[0] == -1.0 and np.isnan(residual)
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_are_on_their_own_rungs():
     starts = np.array([[CARDANO], [-1.5], [2.0], [np.nan]])
 
@@ -203,6 +204,7 @@ def test_a_models_own_equation(law, guess, method, root):
     assert float(system.observe("c.z", 0.0, system.initialize())) == pytest.approx(root, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_are_exact_whichever_rung_found_the_point():
     system = compiled(Law(EqnEnv(), "c", cubic))
 
@@ -220,7 +222,7 @@ def test_gradients_are_exact_whichever_rung_found_the_point():
     assert float(slope) == pytest.approx(numeric, rel=1e-8)
 
 
-@pytest.mark.long("a gradient through a batch of starts")
+@pytest.mark.slow
 def test_one_member_that_fails_does_not_disturb_the_others():
     """z² = p − 1 at x = 1 has no solution for p < 1."""
     system = compiled(Law(EqnEnv(), "c", lambda z: z**2 + 1, p=2.0, z=3.0))

@@ -246,6 +246,7 @@ class Tank(Component):
         self.add_equations(Eq(area * der(h), q - u * c * h**0.5))
 
 
+@pytest.mark.slow
 def test_a_valve_opening_and_its_bounds():
     system = compiled(Tank(EqnEnv(), "tank"))
     _, found = system.initialize(initial={"tank.h": 4.0, "der(tank.h)": 0.0}, solve_for=["tank.u"])

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
+from problems import slow
 
 from jaxonomy_dae.run.system.closed_function import closed_function
 
@@ -45,7 +46,7 @@ ALIKE = {
 }
 
 
-@pytest.mark.parametrize("name", ALIKE)
+@pytest.mark.parametrize("name", slow(ALIKE, "a check", "checks within checks"))
 def test_functions_that_are_written_anew_are_one_program(name):
     one, other = (closed_function(ALIKE[name](), jnp.result_type(float)) for _ in range(2))
     assert jax.tree.structure(one) == jax.tree.structure(other)

@@ -80,7 +80,7 @@ def exact(p):
     return p * jnp.cos(left) - v * jnp.sin(left)
 
 
-@pytest.mark.long("the gradient of a run with events is compiled")
+@pytest.mark.slow
 @pytest.mark.parametrize("only_kinks", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_value_and_gradient(only_kinks):
     found = jax.jit(jax.vmap(jax.value_and_grad(lambda p: final(p, only_kinks)[0])))

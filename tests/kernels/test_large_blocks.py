@@ -52,6 +52,7 @@ def whole_whatever_size(monkeypatch, grid):
         return grid.system()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [6, pytest.param(60, marks=[needs_klu, pytest.mark.slow])])
 def test_resistor_grid(n):
     grid = Grid(n)

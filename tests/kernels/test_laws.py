@@ -72,6 +72,7 @@ def most(network):
 # --- no energy ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size, context", [pytest.param(2, 0, marks=pytest.mark.slow), (3, 2)])
 def test_passive(size, context):
     sizes = tuple(10.0 ** (k - 1) for k in range(size + context))
@@ -88,6 +89,7 @@ def test_passive_with_one_output_is_so_in_rounded_numbers():
     assert (over(drawn(lambda key: Passive(key=key, inputs=0.2, power=7.0)), u) * np.asarray(u) <= 0).all()
 
 
+@pytest.mark.slow
 def test_isotropic_passive():
     laws, u = drawn(lambda key: IsotropicPassive(2, key=key, inputs=3.0)), points(2)
     found = over(laws, u)
@@ -165,6 +167,7 @@ def test_conservative_forces_do_what_the_potential_says():
 # --- shapes ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_odd():
     laws, u = drawn(lambda key: Odd(2, 3, key=key, inputs=(0.1, 10.0), outputs=(1.0, 2.0, 3.0))), points(2)
     np.testing.assert_array_equal(over(laws, -u), -over(laws, u))

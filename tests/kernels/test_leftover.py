@@ -23,6 +23,7 @@ def left(noise, columns=TWICE, **changed):
     )
 
 
+@pytest.mark.slow
 def test_residuals_are_drawn_with_what_a_fit_takes_from_them():
     drawn = left(np.zeros((2, N))).drawn(20_000, np.random.default_rng(1))
     own = np.linalg.qr(TWICE)[0]
@@ -32,6 +33,7 @@ def test_residuals_are_drawn_with_what_a_fit_takes_from_them():
     np.testing.assert_allclose(np.var(held.drawn(20_000, np.random.default_rng(2)), axis=0), [0.5, 1, 1, 1], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_right_models_are_doubted_as_often_as_the_level_says():
     """Tests one by one, each with a bound of its own, doubted right models in 4 of 100 fits and missed half of what
     the same level allows to find."""

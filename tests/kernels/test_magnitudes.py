@@ -51,7 +51,7 @@ def far(law, guess):
     return compiled(component(write))
 
 
-@pytest.mark.long("three models that start by themselves")
+@pytest.mark.slow
 def test_far_away_nothing_is_a_root_that_is_none():
     """Terms of size one were judged beside |∂F/∂p|·|p|: at 1e13, sin(p) = 2 held."""
     for guess in (1e13, 1e17):
@@ -128,6 +128,7 @@ class Cubic(eqx.Module):
         return self.k * u**3
 
 
+@pytest.mark.slow
 def test_forward_derivatives_by_the_weights_of_a_law_in_a_block():
     """Magnitudes read networks, too: not differentiated. z + k·z³ = 2 at k = 1: dz/dk = −z³/(1 + 3·z²) at z = 1."""
 

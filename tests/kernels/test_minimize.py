@@ -9,7 +9,7 @@ import pytest
 from problems import rc_circuit
 
 from jaxonomy_dae import ModelError, compilations
-from jaxonomy_dae.host import tiers
+from jaxonomy_dae.host import program
 from jaxonomy_dae.learning import minimize
 
 
@@ -34,7 +34,7 @@ def distance(model, target):
 
 def test_few_steps_do_not_wait_for_optimization(monkeypatch):
     """The tutorial's 25 steps take 10 ms; their program was optimized first, for 10 of 15.5 processor seconds."""
-    monkeypatch.setattr(tiers, "quick", lambda: {"xla_llvm_disable_expensive_passes": True})
+    monkeypatch.setattr(program, "quick", lambda: {"xla_llvm_disable_expensive_passes": True})
     minimize(bowl(), distance, optax.sgd(0.1), 2, args=(jnp.array(1.0),), progress=False)
     assert compilations()[-1].how == "quick"
 

@@ -74,6 +74,7 @@ def test_values_follow(net, R):
     assert system.parameters.table == net.parameters.table and system.plan is net.plan
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_roots(net):
     """d/dR of (2R − v)·R/(1 + R), in closed form, by the parameter's name and through `partition`."""
 
@@ -113,6 +114,7 @@ def test_bounds_hold_for_values_that_follow(net):
         compiled(r, Capacitor(ev, "c", C=-r.R))
 
 
+@pytest.mark.slow
 def test_siblings_share_in_a_diagram():
     ev = EqnEnv()
     source, ground = VoltageSource(ev, "s", 1.0), Ground(ev, "g")

@@ -40,6 +40,7 @@ def test_products_of_matrices_are_in_full_precision():
         assert "HIGHEST" not in jax.jit(product).lower(jnp.ones((2, 2), jnp.float32)).as_text()
 
 
+@pytest.mark.slow
 def test_runs_are_in_full_precision():
     system = pendulum()
 

@@ -18,6 +18,7 @@ def digits(system) -> list[str]:
     return [value.hex() for array in numbers(system, x) for value in np.asarray(array).tolist()]
 
 
+@pytest.mark.slow
 def test_a_components_name_changes_no_number():
     assert digits(pendulum(drag_on("vx"), name="lambda")) == digits(pendulum(drag_on("vx")))
 

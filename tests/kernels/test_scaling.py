@@ -39,6 +39,7 @@ def _found(system, names):
 # --- contradictions ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "unit, nominal",
     [
@@ -138,6 +139,7 @@ def test_orifices_in_series(pascal, flow):
     assert found(orifices(pascal, flow), "c.pm")[0] == pytest.approx(1.005e7 * pascal, rel=1e-13)
 
 
+@pytest.mark.slow
 def test_roots_in_many_units():
     """The same beside each other, so that one program finds them all: none tells another what is small."""
     parts, expected = [], {}
@@ -239,6 +241,7 @@ def test_guesses_at_which_blocks_are_singular_are_stepped_off():
     np.testing.assert_allclose(found(model(write), "c.x", "c.q", "c.r"), [0.5, math.sqrt(0.5), 0.25], rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "c", [8e-30, pytest.param(8.0, marks=pytest.mark.slow), pytest.param(8e30, marks=pytest.mark.slow)]
 )

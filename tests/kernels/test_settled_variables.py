@@ -83,7 +83,7 @@ def acceleration(pivot, t, position, velocity, p):
     return g - mu * r / MASS
 
 
-@pytest.mark.long("accelerations and their derivatives, beside those by hand")
+@pytest.mark.slow
 @pytest.mark.parametrize("pivot", [Shaken, pytest.param(Pin, marks=pytest.mark.slow)])
 def test_what_is_known_is_not_a_state(pivot):
     """Four states for a pin: its place and velocity were integrated, and projected, beside those of the mass."""
@@ -132,6 +132,7 @@ def test_projection_keeps_all_candidates():
     assert len(system.states) == 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_chains_of_known_variables(seed):
     """x₁ = p·sin(t), xₖ₊₁ = cₖ·xₖ + dₖ, written in any order; the last one prescribes y through p·y + y³ = xₙ."""

@@ -251,6 +251,7 @@ def test_missing_package_names_the_extra(monkeypatch):
     sparse.klu.cache_clear()
 
 
+@pytest.mark.slow
 @installed
 def test_settings_are_left_alone():
     """Kind: effects of an import. KLU's package turns on 64-bit mode for the process; it is not imported without that,

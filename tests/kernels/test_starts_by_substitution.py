@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 from planar_models import double_pendulum
-from problems import compiled, pendulum
+from problems import compiled, pendulum, slow
 from sympy import Eq, cos, sin
 
 from jaxonomy_dae import Component, EqnEnv, der
@@ -16,6 +16,7 @@ def order(system, names=()):
     return substitution(system.plan, initial_rows(system.plan, names))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "build, name, value, levels",
     [
@@ -73,7 +74,7 @@ CURVES = {
 }
 
 
-@pytest.mark.parametrize("name", CURVES)
+@pytest.mark.parametrize("name", slow(CURVES, "a coefficient that may be zero", "a circle", "implicit"))
 def test_what_follows_by_substitution(name):
     curve, bounds, follows = CURVES[name]
     system = compiled(Bead(EqnEnv(), curve, bounds))
@@ -83,6 +84,7 @@ def test_what_follows_by_substitution(name):
     np.testing.assert_allclose(inside, outside, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_derivatives_outside_of_jit():
     """Pullbacks of `jax.jacrev` and `jax.grad` failed: a loop collected residuals that nothing read."""
     system = pendulum()

@@ -99,6 +99,7 @@ def test_an_implicit_solver():
     both(loss, ARGS, Y0, argnums=(0, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("t1, max_steps", [(20.0, 4096), pytest.param(170.0, None, marks=pytest.mark.slow)])
 def test_more_steps_than_rows(t1, max_steps):
     """Pieces are run again, and with the 64 rows and 32 points of large states, points are thinned out beyond 2048."""
@@ -128,7 +129,7 @@ def swung(scale, y0):
     return total(solve(scale, y0, STORED, term=term, saveat=diffrax.SaveAt(ts=TS)))
 
 
-@pytest.mark.long("a gradient in a batch, against its closed form")
+@pytest.mark.slow
 def test_batches():
     """y'' = −k²·y: members that take different numbers of steps, some more than the record has rows, others few."""
     term = diffrax.ODETerm(lambda t, y, k: k * jnp.stack([y[1], -y[0]]))
@@ -349,7 +350,7 @@ def test_without_rank_promotion():
         assert jax.jit(jax.grad(final))(0.7) == pytest.approx(-np.exp(-0.7), rel=1e-4)
 
 
-@pytest.mark.long("a gradient of two solves")
+@pytest.mark.slow
 def test_a_record_that_is_whole_says_nothing_of_another_one():
     """Of two solves in one program, the second has more steps than its record has room for. Inside of `jax.checkpoint`
     it hands on nothing: the first one's record counted for it, and the gradient was not a number."""
@@ -365,6 +366,7 @@ def test_a_record_that_is_whole_says_nothing_of_another_one():
     assert float(jax.grad(run)(jnp.asarray(0.7))) == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_parts_of_parameters_are_read_once():
     """A step's cotangents are as long as what it reads. Each read of a long array inside the step was padded to the
     length of the whole, at every stage: the gradient of a ladder of 4,000 cells by its parameters took 11 times its

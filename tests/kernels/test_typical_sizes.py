@@ -86,6 +86,7 @@ def test_a_start_is_no_rounding_error_where_nothing_else_tells_a_size(unit):
     assert float(system.observe("b.x", 0.0, x)) / unit == pytest.approx(np.log(2), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pressure", "flow"), [SIZES[0], *(pytest.param(*s, marks=pytest.mark.slow) for s in SIZES[1:])]
 )
@@ -113,7 +114,7 @@ def test_declared_sizes_hold_in_models_of_any_size(n):
     assert (np.abs(np.log2(np.asarray(system.typical_sizes)[quantities] / 1e-6)) <= 1).all()
 
 
-@pytest.mark.parametrize("n", [20, 700])
+@pytest.mark.parametrize("n", [20, pytest.param(700, marks=pytest.mark.slow)])
 def test_sizes_come_from_data_in_models_of_any_size(n):
     """Of more than 600 unknowns those that were not declared were 1."""
 

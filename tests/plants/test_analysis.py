@@ -123,6 +123,7 @@ def temperature(Q, eps):
     return steady_state(system, inputs={"heater.Q_flow": Q}, throw=False)["body.T"]
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_steady_state():
     """T = (T0⁴ + Q/(eps·sigma·A))^¼: derivatives by parameters and inputs, inside jit and vmap."""
     at = jnp.array([20.0, 100.0, 500.0]), jnp.array([0.8, 0.8, 0.3])
@@ -167,6 +168,7 @@ def test_an_implicit_block():
     np.testing.assert_allclose(v + i * (10.0 + 500.0), 3.0, rtol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_a_free_integrator_is_named():
     with pytest.raises(SteadyStateError, match=r"singular: nothing determines 'motor\.rotor\.phi'.*drifting=\['motor"):
         steady_state(motor(), inputs={"source.u": 0.0})
@@ -274,6 +276,7 @@ def test_a_batch_of_points():
 # --- linear state spaces -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_transfer_function_of_a_dc_motor():
     """w/u = k/((L·s + R)·(J·s + d) + k²), from rest, where the angle is free."""
     omega = np.array([0.0, 1.0, 30.0, 1e3])
@@ -312,6 +315,7 @@ def test_a_notch_filter():
     assert abs(found[3]) < ROUNDING
 
 
+@pytest.mark.slow
 def test_poles_and_their_gradient():
     """s = −D/(2·M) ± j·√(K/M − D²/(4·M²))."""
     system = oscillator()
@@ -521,6 +525,7 @@ def test_solutions_as_tables():
         batch.to_pandas()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pandas", "xarray", "control"])
 def test_missing_packages_name_the_extra(monkeypatch, name):
     solution, space = run(), spring()

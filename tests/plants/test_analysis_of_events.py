@@ -79,6 +79,7 @@ def sampled_proportional():
     return one(build)
 
 
+@pytest.mark.slow
 def test_a_sampled_loop_rests_where_a_tick_changes_nothing():
     """Discrete variables were constants for a steady state: it cut the loop without a word, and said 0 for 1."""
     names = ["pl.x", "pl.u", "pi.held", "pi.total", "pl.e"]
@@ -86,6 +87,7 @@ def test_a_sampled_loop_rests_where_a_tick_changes_nothing():
     np.testing.assert_allclose(jax.jit(lambda s: steady_state(s)["pi.total"])(held_at_one()), 1.0, rtol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_a_sampled_loop_has_no_continuous_state_space():
     """The controller's output was held constant, and the poles were those of the plant alone."""
     with pytest.raises(ModelError, match=r"'c\.u', which 'c: when\(sampled\(T\)\)' writes.*sampled=True"):
@@ -94,7 +96,7 @@ def test_a_sampled_loop_has_no_continuous_state_space():
     assert np.isnan(inside).all()
 
 
-@pytest.mark.long("a linear model from tick to tick, its derivative, and what it is read by")
+@pytest.mark.slow
 def test_the_change_from_tick_to_tick():
     """x after a period is e·x + (1 − e)·u with e = exp(−T), u = 3·(r − x)."""
     T = 0.1
@@ -116,7 +118,7 @@ def test_the_change_from_tick_to_tick():
     np.testing.assert_allclose(jax.jit(jax.grad(pole))(T), -4 * e, rtol=ROUNDING)
 
 
-@pytest.mark.long("two programs of a model with two clocks")
+@pytest.mark.slow
 def test_clocks_with_a_common_period():
     """u = w − 2·x every 0.1, w grows by 0.1·(r − x) every 0.3, 0.05 later: the product of ticks and flows."""
 
@@ -138,6 +140,7 @@ def test_clocks_with_a_common_period():
     np.testing.assert_allclose(space.dt, 0.3, rtol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_clocks_without_a_common_period_are_refused():
     def build(c):
         u, w = c.discrete("u"), c.discrete("w")
@@ -149,6 +152,7 @@ def test_clocks_without_a_common_period_are_refused():
         linearize(one(build), [], ["c.x"], sampled=True)
 
 
+@pytest.mark.slow
 def test_a_counter_does_not_rest_unless_it_may_go_on():
     def build(c):
         n = c.discrete("n")
@@ -180,7 +184,7 @@ def rectifier():
     return one(build)
 
 
-@pytest.mark.long("value and derivative of a search over modes")
+@pytest.mark.slow
 def test_the_operating_point_of_a_rectifier():
     """Conducts for E > 0, v = E·500/510, and blocks for E < 0; which is found, inside jit and vmap alike. The mode was
     that of the declaration."""
@@ -194,6 +198,7 @@ def test_the_operating_point_of_a_rectifier():
     np.testing.assert_allclose(others, [[0.0, 1.0], [-5.0, 0.0]], atol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_a_rectifier_between_its_modes_is_not_linear():
     """At E = 0 small deviations of one sign conduct: the linear model is that of neither side."""
     with pytest.raises(ModelError, match=r"'c: when\(.*turns.*beside it"):
@@ -202,7 +207,7 @@ def test_a_rectifier_between_its_modes_is_not_linear():
     np.testing.assert_allclose(conducting.A, [[-(1 / 10 + 1 / 500) / 1e-3]], rtol=ROUNDING)
 
 
-@pytest.mark.long("a search over the modes of two diodes")
+@pytest.mark.slow
 def test_a_limiter_with_two_diodes():
     """E behind 10 Ω, 100 Ω to ground, and ideal diodes to ±1 V: v = min(max(E·100/110, −1), 1)."""
 
@@ -219,6 +224,7 @@ def test_a_limiter_with_two_diodes():
     np.testing.assert_allclose(found, known, atol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_a_ball_rests_on_the_floor():
     """Without the floor there is no equilibrium: the contact that lets there be one is found."""
 
@@ -232,7 +238,7 @@ def test_a_ball_rests_on_the_floor():
     np.testing.assert_allclose(point[["c.h", "c.v", "c.f", "c.active"]], [0.0, 0.0, 2 * 9.81, 1.0], atol=ROUNDING)
 
 
-@pytest.mark.long("two searches over the modes of friction")
+@pytest.mark.slow
 def test_friction_that_sticks():
     """A mass under 2 N behind friction of 3 to 5 N stays where it starts; nothing else says where, which the error
     says, with all that must be kept. Under 6 N it slides and does not rest."""
@@ -256,9 +262,9 @@ def test_friction_that_sticks():
 @pytest.mark.parametrize(
     "what, match",
     [
-        ("thermostat", r"no steady state.*without end.*drifting=\['c\.on'\]"),
+        pytest.param("thermostat", r"no steady state.*without end.*drifting=\['c\.on'\]", marks=pytest.mark.slow),
         ("neuron", r"no steady state.*without end, as 'c: when\(x >= 1\)'"),
-        ("fuse", r"holds at the equilibrium, where it ends the run \('hot'\)"),
+        pytest.param("fuse", r"holds at the equilibrium, where it ends the run \('hot'\)", marks=pytest.mark.slow),
     ],
 )
 def test_what_events_do_not_let_rest(what, match):
@@ -280,7 +286,7 @@ def test_what_events_do_not_let_rest(what, match):
     assert np.isnan(steady_state(system, throw=False).x).all()
 
 
-@pytest.mark.long("value and derivative of a search over events")
+@pytest.mark.slow
 def test_an_event_on_the_way_has_happened():
     """x' = −x + 2 + l; above 1, l becomes 2·w, and stays: x = 2 + 2·w, with the derivative 2 by w."""
 
@@ -299,6 +305,7 @@ def test_an_event_on_the_way_has_happened():
     np.testing.assert_allclose([by_w, latched], [2.0, 6.0], rtol=ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x, total", [(0.0, 5.0), (3.0, -5.0)])
 def test_a_saturated_start(x, total):
     """A PI controller bounded by ±0.5 holds x' = −x + u at 0.4. Where it starts at a bound, no slope depends on its

@@ -104,6 +104,7 @@ def test_an_array_of_inputs_is_its_entries(shape):
         np.testing.assert_allclose(whole[f"{name}.x"], single[f"{name}.x"], rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [3, pytest.param(40, marks=pytest.mark.slow)])
 def test_the_model_differentiates_them(n):
     """du/dt of functions for all, and of defaults that are constant."""

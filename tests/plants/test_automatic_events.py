@@ -109,6 +109,7 @@ LAWS = {  # the law as it is written, surfaces, and the law where these have cer
 QUICK = ("jump",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in LAWS])
 def test_runs_and_gradients(name):
     law, surfaces, branch = LAWS[name]
@@ -200,6 +201,7 @@ def test_equations_are_shown_as_written():
     assert broken.as_written == {}
 
 
+@pytest.mark.slow
 def test_relations_of_parameters_and_events_alone_are_not_watched():
     class Modes(Component):
         def __init__(self, ev, name):

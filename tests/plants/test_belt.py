@@ -13,7 +13,7 @@ from jaxonomy_dae import Eq, assign, der, simulate
 TIMES = jnp.array([5.001, 5.1, 7.0, 9.4, 13.5, 30.0])  # the mass comes free at t = 5
 
 
-@pytest.mark.long("two runs with derivatives are compiled")
+@pytest.mark.slow
 def test_a_relation_of_the_speed_that_sticking_stops():
     """Stribeck's law of |vb − v| and of vb − v, which is the same while the mass slides, have the same derivatives by
     the largest friction. Where v leaves vb slowly, the relation turns a little later, at the edge of rounding, and was

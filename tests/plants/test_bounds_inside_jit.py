@@ -40,7 +40,7 @@ def gradient(system):
     return jax.jit(jax.vmap(of_k))
 
 
-@pytest.mark.long("a batch of gradients")
+@pytest.mark.slow
 def test_values_out_of_bounds_are_not_a_number(gradient):
     """k = −3 gave exp(3) inside jit; k = 5 puts the parameter computed from it out of its bounds. One member of a batch
     with NaN made all wait for max_steps rejected steps, and was called `max_steps_reached`."""
@@ -81,6 +81,7 @@ def test_however_values_arrive(system):
     assert np.isnan(jax.jit(lambda s: s.vector_field(0.0, jnp.ones(1), {"c.u": 0.0}))(combined)).all()
 
 
+@pytest.mark.slow
 def test_an_input_that_stops_being_finite(system):
     """√(a − t) from t = a on, which only the run meets."""
     run = jax.jit(lambda a: end(system, lambda t: jnp.sqrt(a - t)))

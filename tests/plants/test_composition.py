@@ -44,6 +44,7 @@ class Sensor(eqx.Module):
         return self.gain * simulate(self.circuit, ts[-1], ts=ts, rtol=1e-10, atol=1e-12)["c.v"]
 
 
+@pytest.mark.slow
 def test_inside_a_users_module_gradients_reach_everything(rc):
     @eqx.filter_jit
     @eqx.filter_value_and_grad
@@ -60,6 +61,7 @@ def test_inside_a_users_module_gradients_reach_everything(rc):
     assert float(gradient.gain) == pytest.approx(V * (1 - e), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_serialised_and_read_back(rc, plain, tmp_path):
     field = jax.jit(lambda system, x: system.vector_field(0.0, x))
     for system in (rc, plain):
@@ -220,6 +222,7 @@ def test_jvp(rc):
 # --- solvers -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_raw_diffrax(rc):
     @jax.jit
     def solve():
@@ -239,6 +242,7 @@ def test_raw_diffrax(rc):
     np.testing.assert_allclose(solve(), np.stack([rc_voltage(TS), current, -current], axis=1), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, options",
     [
@@ -322,6 +326,7 @@ class Counting(eqx.Module):
         return -self.k * u
 
 
+@pytest.mark.slow
 def test_nothing_is_traced_again_for_new_values():
     traces = Traces()
     system = learned_decay(Counting(jnp.array(1.0), traces))

@@ -63,6 +63,7 @@ def on_a_ramp():
     return cases, values[:, 0, :8].reshape(-1, 4, 2), values[:, 1, :8].reshape(-1, 4, 2), values[:, 1, 8:], counts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(4), ids=CONDITIONS)
 def test_where_a_condition_is_at_the_start(k):
     """x = x0 + rate·t, x0 and rate −1, 0, 1. An event is a condition that is false at some time and true right after:
@@ -83,6 +84,7 @@ def test_where_a_condition_is_at_the_start(k):
         np.testing.assert_allclose(integral[k], 2 * during, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_events_at_once_are_listed():
     """Upwards from 0, x > 0 becomes true for two events, one of which happens at the start; from −1, all four do."""
     cases, *_, counts = on_a_ramp()
@@ -146,6 +148,7 @@ def evaluated(wave):
     return sympy.lambdify(u, wave(u), [many, "numpy"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", NESTED)
 def test_relations_within_relations(kind):
     """∫ f(w·t) dt = ∫₀^{wT} f(u) du / w, whose derivative by w is f(wT)·T/w minus itself over w. A relation that jumps
@@ -173,6 +176,7 @@ def random_wave(rng, atoms, depth):
     ][rng.integers(9)]()  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [pytest.param(s, marks=pytest.mark.slow) if s else s for s in range(6)])
 def test_random_relations_within_relations(seed):
     """Of time, of sines of it, and of states that are these."""
@@ -203,6 +207,7 @@ def test_random_relations_within_relations(seed):
         np.testing.assert_allclose(found, sums[:: cells // 12], atol=2e-4, err_msg=str(wave))
 
 
+@pytest.mark.slow
 def test_conditions_of_events_whose_sides_jump():
     """Each turns on a clock n' of its own: the events' times over w, and what moves with w."""
     w, end = 1.53, 2.0
@@ -260,6 +265,7 @@ def at_one_instant(order):
     return compiled(component(write))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0), (3, 1, 0, 5, 2, 4)])
 def test_events_at_one_instant_in_any_order(order):
     """All read the states before any of them, discrete variables with `pre` as before all, and without as assigned at

@@ -21,7 +21,7 @@ def swing():
     return simulate(system, 1.0, ts=TS)
 
 
-@pytest.mark.long("compiles one run of a pendulum, the least model with hidden constraints")
+@pytest.mark.slow
 def test_a_run_is_certified(swing):
     found = assert_constraints(swing, rtol=1e-12, atol=1e-12)
     assert found.holds and "2 hidden constraints at 11 saved times" in found.checked

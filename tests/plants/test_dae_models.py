@@ -241,6 +241,7 @@ def test_a_model_reports_its_turning_point(folded, solver):
     assert np.isnan(np.asarray(found.states)[TS > 4.1]).all()
 
 
+@pytest.mark.slow
 @ALSO_BDF
 def test_a_model_that_is_not_finite_at_its_start(folded, solver):
     system = folded.with_parameters({"cell.a": 1.0, "cell.b": 3.0})

@@ -33,6 +33,7 @@ def stiff():
     return compiled(Followers(EqnEnv(), "f", 1, 1e6))
 
 
+@pytest.mark.slow
 def test_a_stiff_model_is_finished(stiff):
     solution = simulate(stiff, 10.0, ts=TS)
     np.testing.assert_allclose(solution["f.x0"], np.cos(1.3 * np.asarray(TS)), rtol=0, atol=1e-5)
@@ -262,7 +263,7 @@ class Burning(Component):
             self.add_equations(Eq(der(c), -rate), Eq(der(T), (900.0 + 50 * i - T) / 200 + 0.01 * rate))
 
 
-@pytest.mark.long("two solvers of a stiff model")
+@pytest.mark.slow
 def test_rejected_steps_do_not_repeat():
     """Kind: a run that rejects steps without end. A step that ended at infinity had an error that is not a number, from
     which the controller proposed the same step again: 8 steps accepted and 16,376 rejected."""
@@ -284,7 +285,7 @@ class Depleting(Component):
         self.add_equations(Eq(der(x), -k * (x - sympy.cos(ev.t))), Eq(der(k), k))
 
 
-@pytest.mark.long("runs of two solvers are compiled")
+@pytest.mark.slow
 def test_explicit_steps_that_do_not_suffice():
     """Kind: a run that cannot end is stopped by the number of its steps. Explicit steps that the user chose went on, a
     fifth of them rejected, to max_steps; the run ends where they will not suffice, and inside jit with that code."""

@@ -92,20 +92,24 @@ def angle_of_no_drag():
     return true(0.0)[0]
 
 
-def test_twenty_seeds(problem, fit):
+# (noise in m, seeds, how many of them find the form at least, the largest error of c): parts that fit into a box
+SEEDS = [(1e-3, range(k, k + 5), 5, 1e-3) for k in (1, 6, 11, 16)] + [(1e-2, range(1, 21), 18, 1e-2)]
+
+
+@pytest.mark.parametrize("noise, seeds, least, most", SEEDS)
+def test_twenty_seeds(problem, fit, noise, seeds, least, most):
     """At 1 mm all forms are right and c is within 0.1 %; at 1 cm nearly all, and within 1 %. Nothing is compiled."""
     first = fit.discover("drag", powers(4))
     count = len(PROGRAMS)
-    for noise, least, most in ((1e-3, 20, 1e-3), (1e-2, 18, 1e-2)):
-        right, errors = 0, []
-        for seed in range(1, 21):
-            again = problem.fit(record(seed, noise), start=fit.system)
-            found = again.discover("drag", powers(4))
-            right += found.chosen.terms == first.chosen.terms
-            single = next(c for c in found.candidates if c.terms == first.chosen.terms)
-            errors.append(abs(float(single.law.coefficients[0]) / DRAG + 1))
-        print(f"{1e3 * noise:g} mm: {right} of 20, c within {100 * max(errors):.3f} %")
-        assert right >= least and max(errors) < most
+    right, errors = 0, []
+    for seed in seeds:
+        again = problem.fit(record(seed, noise), start=fit.system)
+        found = again.discover("drag", powers(4))
+        right += found.chosen.terms == first.chosen.terms
+        single = next(c for c in found.candidates if c.terms == first.chosen.terms)
+        errors.append(abs(float(single.law.coefficients[0]) / DRAG + 1))
+    print(f"{1e3 * noise:g} mm: {right} of {len(seeds)}, c within {100 * max(errors):.3f} %")
+    assert right >= least and max(errors) < most
     assert len(PROGRAMS) == count
 
 

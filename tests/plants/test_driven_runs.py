@@ -76,6 +76,7 @@ def test_steps_without_what_drives_them():
     assert abs(float(found["c.v"][-1]) - exact()[-1]) > 1
 
 
+@pytest.mark.slow
 def test_a_source_that_is_switched_off_limits_no_step():
     """Kind: what has no effect costs the run. A source of amplitude zero and 1e6 rad/s limited steps to a quarter of
     its period: max_steps at t = 0.026."""

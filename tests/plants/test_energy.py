@@ -271,7 +271,7 @@ def block():
     return compiled(Block(EqnEnv(), "b", shares))
 
 
-@pytest.mark.long("three programs: a run, and two along which powers are integrated")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "spring, lost, gained",
     [
@@ -363,6 +363,7 @@ def test_accounts_inside_jit_and_batches():
         jax.jit(lambda d: simulate(system.with_parameters({"b.d": d}), 1.0, ts=ts).energy_balance_error())(0.6)
 
 
+@pytest.mark.slow
 def test_the_second_run_takes_the_options_of_the_first():
     """Kind: a run that is made again forgets what it was asked for. A pulse of 1 ms in 100 s, which `jump_ts` resolves,
     was stepped over in the run that integrates powers, and a right model did not balance."""

@@ -7,6 +7,7 @@ import traceback
 import diffrax
 import jax
 import pytest
+from problems import slow
 
 from jaxonomy_dae import (
     AcausalCompiler,
@@ -218,7 +219,7 @@ def title(provoke) -> str:
     return provoke.__name__.replace("_", " ").replace("scipy", "SciPy")
 
 
-@pytest.mark.parametrize("provoke", PROVOKED, ids=title)
+@pytest.mark.parametrize("provoke", slow(PROVOKED, chattering, a_ball_that_comes_to_rest), ids=title)
 def test_the_text_on_the_page(provoke):
     assert on_the_page()[title(provoke)] == seen(provoke)
 

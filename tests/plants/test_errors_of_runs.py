@@ -12,6 +12,7 @@ from jaxonomy_dae import EqnEnv, InitializationError, ModelError, SimulationErro
 from jaxonomy_dae.library import electrical as el
 
 
+@pytest.mark.slow
 def test_non_finite_parameters_and_weights_are_named():
     rc = rc_circuit()
     broken = eqx.tree_at(lambda s: s.parameters.values, rc, rc.parameters.values.at[1].set(jnp.nan))
@@ -38,6 +39,7 @@ def test_a_start_at_a_singular_point():
         simulate(compiled(component(write)), 1.0, ts=jnp.array([1.0]))
 
 
+@pytest.mark.slow
 def test_a_run_from_contradicting_starts():
     """y = x³ + x, started at x = 3 and y = 10."""
 

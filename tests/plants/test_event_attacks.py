@@ -181,7 +181,7 @@ def dropped():
     return model(write)
 
 
-@pytest.mark.long("a run is compiled; kernels have the closed form")
+@pytest.mark.slow
 @pytest.mark.parametrize("e, why", [(0.0, "the equations make it true at once"), (0.5, "accumulate at t=1.35457")])
 def test_a_ball_does_not_fall_through_the_floor(e, why):
     """Bounces accumulate at √(2h/g)·(1 + e)/(1 − e)."""
@@ -259,7 +259,7 @@ def truths(u):
     return np.array([u > 0, u >= 0, u < 0, u <= 0], float)
 
 
-@pytest.mark.long("a run is compiled")
+@pytest.mark.slow
 def test_an_input_that_jumps_over_a_level_or_onto_it():
     """A guard that has jumped when the step begins does not fall any more. Clutches pressed by a step from 0 were
     pressed when the next event came, 0.16 s later, and what was on while u > 0 stayed on for u = 0, without a word."""
@@ -278,6 +278,7 @@ def test_an_input_that_jumps_over_a_level_or_onto_it():
     np.testing.assert_allclose(jax.lax.map(reached, jnp.asarray(cases)), known, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", [pytest.param("a corner", marks=pytest.mark.slow), "a ramp"])
 def test_a_quantity_that_stays_at_zero_is_there_once(left):
     def write(self, ev):
@@ -306,7 +307,7 @@ def test_more_than_a_hundred_events_are_listed():
     assert len(solution.events.names) == 150
 
 
-@pytest.mark.long("runs with saved steps and with saved times are compiled, each in jit, too")
+@pytest.mark.slow
 def test_a_run_that_ends_where_it_begins():
     """x' = 1000 from 1, and the end where x ≥ 1/2, at the start, too: one row. A first step was taken, to 0.001."""
 

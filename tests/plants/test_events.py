@@ -101,6 +101,7 @@ def bounced():
     return simulate(ball(), 3.0, ts=EVENLY, **ROOM)
 
 
+@pytest.mark.slow
 def test_what_a_solution_says_of_events(bounced):
     events = bounced.events
     np.testing.assert_allclose(events.ts[:6], BOUNCES, rtol=0, atol=1e-10)
@@ -193,7 +194,7 @@ def test_second_derivatives_are_refused():
             jax.eval_shape(twice, 0.8)
 
 
-@pytest.mark.long("a gradient in a batch is traced")
+@pytest.mark.slow
 def test_memory_of_gradients_in_a_batch():
     """The log of events was part of each of 385 kept states: 1.65 MB for a ball. It is kept once, beside a state of 16
     numbers, in few rows where there are many members."""

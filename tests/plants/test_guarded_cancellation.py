@@ -31,7 +31,7 @@ def at_one(p):
     return jnp.stack([solution["c.y1"][0], solution["c.y2"][0]])
 
 
-@pytest.mark.long("two programs: outside of jit, and inside")
+@pytest.mark.slow
 def test_what_cancels_at_the_values_compiled_with_does_not_elsewhere():
     """That it cancels was judged from parameters up to a hundred times those given. Beyond 10⁴ the wrong equation was
     integrated without a word: y2(0) = −1e-4 for p = 1e5, which leaves y2 to its start."""

@@ -42,6 +42,7 @@ def test_a_simulation_is_exported(decay):
         np.testing.assert_allclose(exported.call(1.5), expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_traced_solves_raise_only_if_told_to(decay):
     term = DAETerm(lambda t, x, z, a: -x, lambda t, x, z, a: z**2 - x)
     start = jnp.ones(1), jnp.full(1, 2.0)  # inconsistent
@@ -51,6 +52,7 @@ def test_traced_solves_raise_only_if_told_to(decay):
         eqx.filter_jit(lambda k: solve_dae(term, k, start, solver=BDF(), throw=True).ys)(1.0)
 
 
+@pytest.mark.slow
 def test_times_that_do_not_fit(decay):
     """Inside a program, where nobody can look at them before it runs."""
 
@@ -116,6 +118,7 @@ def test_a_second_process_finds_its_programs_in_the_cache(tmp_path):
     assert first[1] > 0 and second[0] > 0 and second[1] == 0
 
 
+@pytest.mark.slow
 def test_a_user_s_own_diffrax_solve_keeps_its_checks(decay):
     def own(ts):
         term = diffrax.ODETerm(lambda t, y, a: -y)

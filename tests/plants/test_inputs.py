@@ -142,6 +142,7 @@ def test_what_a_branch_reads_is_read_again(lag):
         np.testing.assert_allclose(solution["m.y"], value, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_new_functions_of_the_same_form_share_a_program(lag):
     def call(gain, knots):
         return simulate(
@@ -262,6 +263,7 @@ def test_a_batch_of_samples(lag):
     np.testing.assert_allclose(last(heights), heights * PULSED, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_linear_input_that_is_differentiated_jumps(rate):
     """x = u(t) − u(0) + ∫u, u' is a step function."""
     times, values = np.array([0.0, 0.5, 0.52, 1.0]), np.array([0.0, 0.0, 1.0, 1.0])

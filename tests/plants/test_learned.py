@@ -166,6 +166,7 @@ def implicit_law(i):
     return jnp.log1p(i / 0.4)
 
 
+@pytest.mark.slow
 def test_a_resistor_with_a_learned_law():
     solution, v = together(), diode_discharge(T)
     np.testing.assert_allclose(solution["store.v"], v, **CLOSE)
@@ -216,6 +217,7 @@ def test_gradients_reach_the_weights_inside_an_algebraic_equation():
     assert float(gradient.neural["r.law"].k) == pytest.approx(-1.3 / 0.5, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_correction_that_depends_on_the_tension():
     """Friction of the link, N = −0.3·lam on vx: the multiplier depends on the force and the force on the multiplier."""
     solution, ts = together(), TS[TS <= 1.0]

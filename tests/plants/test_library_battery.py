@@ -303,6 +303,7 @@ def test_a_heated_pack():
     balanced(small(), 900.0, load_of((2, 2)))
 
 
+@pytest.mark.slow
 @checks({Pack: (ROWS, "pack.cell.soc", "pack.p.v")}, origin="rtol 1e-9 for each of fewer than 200 steps")
 def test_a_pack_without_heat():
     shape = (3, 2)

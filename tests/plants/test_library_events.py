@@ -372,7 +372,7 @@ def test_stick_and_slip():
     np.testing.assert_array_equal(run.values("f.mode", ts), [0, 1, 1, 0, 1, 1])
 
 
-@pytest.mark.long("a run with events is compiled")
+@pytest.mark.slow
 def test_friction_does_not_hold_a_prescribed_motion():
     """Kind: a mode that cannot hold what it is to hold. The friction of parts that are moved by a source had the wrong
     sign where they turned back: sticking and breaking away followed each other without end. Friction has the sign of
@@ -400,7 +400,7 @@ def test_friction_does_not_hold_a_prescribed_motion():
     np.testing.assert_allclose(solution["other.f"], -SLIDING * sign, rtol=1e-12)
 
 
-@pytest.mark.long("a run with an impulse is compiled")
+@pytest.mark.slow
 def test_a_freewheel_that_begins_by_slipping_the_wrong_way():
     """J·w is conserved where flange_b catches up at once: it stayed slower by 10 rad/s, "locked"."""
     ev = EqnEnv()

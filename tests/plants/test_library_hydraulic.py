@@ -55,6 +55,7 @@ PUMPED = "SciPy's DOP853 of an accumulator behind a pump on a shaft"
 PUSHED = "closed form of a piston behind a narrow pipe"
 
 
+@pytest.mark.slow
 @checks(
     {
         Tank: ("Torricelli's law: √level falls linearly", "tank.level", "gauge.p"),

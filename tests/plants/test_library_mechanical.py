@@ -197,6 +197,7 @@ def pairs(t, d):
     }
 
 
+@pytest.mark.slow
 @checks(
     pairs("t", line)
     | pairs("r", rot)

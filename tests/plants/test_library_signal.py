@@ -35,6 +35,7 @@ class Reader(Component):
         self.add_equations(Eq(der(x), y))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "differentiated",
     [
@@ -108,6 +109,7 @@ def loop(k, law=None):
     return compiled(u, gain, error, back, connect=pairs)
 
 
+@pytest.mark.slow
 def test_loops_without_memory_are_solved():
     linear = loop(4.0)
 
@@ -291,6 +293,7 @@ def test_a_limited_pi_controller():
         measured("pi.x", 4.0 * solution[f"{name}.x"], run.y[1], 1e-6)
 
 
+@pytest.mark.slow
 @checks(
     {sig.Noise: ("mean, variance and correlation of independent normal values", "mean", "variance", "correlation")},
     origin="four standard deviations of 2,000 values",

@@ -53,6 +53,7 @@ def radiating_time(T, T0, around, rate):
     return (primitive(T) - primitive(T0)) / (4 * around**3 * rate)
 
 
+@pytest.mark.slow
 @checks(
     {
         HeatCapacitor: ("exponential of Newton's cooling", "probe.T"),
@@ -158,6 +159,7 @@ def shield_temperature(T):
     return scipy.optimize.brentq(balance, 1.0, 1e3, xtol=1e-12)
 
 
+@pytest.mark.slow
 def test_temperatures_that_radiation_determines():
     """A shield between two bodies: of the roots of a fourth power only the one above zero is a temperature."""
     system, bodies = shielded(), ["body0.T", "body1.T", "frame.T"]

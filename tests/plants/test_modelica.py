@@ -18,7 +18,7 @@ def compiled(text, **options):
     return AcausalCompiler(ev, diagram)()
 
 
-@pytest.mark.long("a gradient through events")
+@pytest.mark.slow
 def test_a_ball_and_its_gradient():
     """h(3) and its derivative by the restitution, from the closed form (h0 = 1, e = 0.8, g = 9.81)."""
     system = compiled(BALL)
@@ -33,7 +33,7 @@ def test_a_ball_and_its_gradient():
     assert slope == pytest.approx(1.16388772098508, abs=1e-7)
 
 
-@pytest.mark.long("two modes and a loop of events in one program")
+@pytest.mark.slow
 def test_friction_by_a_discrete_equation():
     """A block slides from 2 m/s until t = 2 s (mu = 1 N, m = 1 kg), sticks, and slips when the force t - 4 has reached
     1.5 N, at t = 5.5 s; then der(v) = t - 4 - 1."""
@@ -62,7 +62,7 @@ def test_modes_that_hand_on_a_token_change_at_once():
     np.testing.assert_allclose([solution["m.ta"][-1], solution["m.tb"][-1]], [3.0, 2.5], atol=1e-9)
 
 
-@pytest.mark.long("modes that change at once, and two whens of one instant")
+@pytest.mark.slow
 def test_a_when_that_rests_on_what_another_one_assigns_at_the_same_instant():
     """Whether the second way is open was judged by the time since which the first one was open before it opened: the
     second one seemed closed, so that its own time was not set, and it was passed at once."""
@@ -95,7 +95,7 @@ end 'Whens';
 """
 
 
-@pytest.mark.long("events of two chains in one program")
+@pytest.mark.slow
 def test_an_elsewhen_acts_when_its_condition_becomes_true():
     """A branch happened when the condition of an earlier branch ended, and did not while that held. Which of them
     *become* true at an instant is asked: the first of these acts."""

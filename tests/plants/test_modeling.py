@@ -36,6 +36,7 @@ def rc(ev) -> Model:
     return [source, r, c, ground], [(source.p, r.p), (r.n, c.p), (c.n, source.n, ground.p)]
 
 
+@pytest.mark.slow
 def test_rc(solution):
     v = rc_voltage(T, v0=-1.0)
     np.testing.assert_allclose(solution["rc.c.v"], v, **CLOSE)
@@ -67,6 +68,7 @@ def test_rlc(solution):
     )
 
 
+@pytest.mark.slow
 def test_voltage_divider_is_purely_algebraic():
     ev = EqnEnv()
     source, top, bottom, ground = VoltageSource(ev, "s", 6.0), Resistor(ev, "a", 1.0), Resistor(ev, "b", 2.0), Ground(
@@ -236,6 +238,7 @@ def hierarchy(ev) -> Model:
     return [source, ladder, ground], [(source.p, ladder.p), (ladder.n, source.n, ground.p)]
 
 
+@pytest.mark.slow
 def test_hierarchy_and_signs(solution):
     names = [
         "x.p.i", "x.n.i", "s.i", "x.r.v", "x.first.p.i", "x.first.n.i", "x.first.r1.i", "x.first.r2.i", "x.second.r2.i",
@@ -264,6 +267,7 @@ def own_ports(ev) -> Model:
     return [unit, spring, wall], [(wall.flange, spring.flange_a), (spring.flange_b, unit.flange)]
 
 
+@pytest.mark.slow
 def test_own_ports_in_equations(solution):
     # Force into the unit: −K·x = −2.4; acceleration −1.2.
     names = ["u.double", "u.pull", "u.mass.flange.f", "s.f", "w.flange.f"]
@@ -459,6 +463,7 @@ def test_names(system, solution):
 # --- parameters --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_partition_and_combine_give_the_system_back():
     system = pendulum(drag_on("vx", "vy", network=mlp(2, 2)))
     trainable, frozen = system.partition("pend.m", "drag")

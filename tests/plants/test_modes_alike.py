@@ -51,7 +51,7 @@ def in_all_modes(f, batch):
     yield "vmap over one", jax.tree.map(lambda v: jnp.repeat(v, len(batch[0]), 0), one)
 
 
-@pytest.mark.long("five programs")
+@pytest.mark.slow
 def test_failing_members_are_alike(run):
     """Kind: `jax.vmap` outside of jit raised for the whole batch and did not say for which member, where jit(vmap)
     gives NaN in its rows."""
@@ -66,7 +66,7 @@ def test_failing_members_are_alike(run):
         np.testing.assert_array_equal(code[first], found["jit"][1][first], err_msg=mode)
 
 
-@pytest.mark.long("batches outside of jit")
+@pytest.mark.slow
 def test_failing_members_are_named(run):
     """Kind: as above; and nested, in any order of axes."""
     with pytest.warns(RuntimeWarning, match=r"under jax.vmap, member 1 of 3: no step was short enough"):
@@ -103,7 +103,7 @@ SAMPLES = {
 }
 
 
-@pytest.mark.long("five programs")
+@pytest.mark.slow
 def test_samples_are_judged_alike(run):
     """Kind: what is refused outside jit goes on inside: samples that end before t1 were extrapolated."""
     fine = np.array([0.0, 0.5, 1.0]), np.array([0.0, 1.0, 2.0])
@@ -153,7 +153,7 @@ def lag():
     return compiled(component(write))
 
 
-@pytest.mark.long("gradients of two runs")
+@pytest.mark.slow
 def test_lists_may_hold_what_is_traced(lag):
     """Kind: what is traced is allowed wherever its value is. `jump_ts=[te]` under `grad`, and samples and times in
     lists, were JAX's bare TracerArrayConversionError. x(1) = 1/e + 1 − exp(te − 1) for a step at te."""
@@ -172,6 +172,7 @@ def test_lists_may_hold_what_is_traced(lag):
     np.testing.assert_allclose(jax.grad(sampled)(0.3), 0.0, atol=1e-5)  # x = 1 as long as u = 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["max_steps", "max_events", "save_events", "throw", "progress"])
 def test_what_the_program_hangs_on_is_refused_if_traced(lag, name):
     """Kind: as above. A traced `save_events` became part of the key under which programs are kept, and every later call
@@ -183,7 +184,7 @@ def test_what_the_program_hangs_on_is_refused_if_traced(lag, name):
     assert np.isfinite(simulate(lag, 1.0, ts=TS)["c.x"]).all()
 
 
-@pytest.mark.long("three solvers")
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [Tsit5(), Rodas5P(), BDF()])
 def test_saved_times_do_not_move_the_solution(system, solver):
     """Kind: what is asked changes the answer. x = 1/(1 + t) for k = −1."""

@@ -64,6 +64,7 @@ def known(k):
     return (scipy.linalg.expm(mode(False) * (0.5 - DUTY) * PERIOD) @ x)[:2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("beside", [None, Ball, Stop])
 def test_converters_beside_others(count, beside):

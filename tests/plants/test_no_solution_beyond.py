@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import sympy
-from problems import compiled
+from problems import compiled, slow
 from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv, SimulationError, der, simulate
@@ -55,8 +55,7 @@ class Root(Component):
         self.add_equations(Eq(der(x), y), Eq(y**2, x))
 
 
-@pytest.mark.parametrize("way", ["default", "Rodas5P", "BDF"])
-@pytest.mark.long("runs by three solvers are compiled")
+@pytest.mark.parametrize("way", slow(["default", "Rodas5P", "BDF"], "default", "Rodas5P"))
 def test_a_branch_point_is_not_stepped_over(way):
     """Kind: a solver that goes on where others refuse. BDF extrapolated y through zero, and took one of the branches:
     the determinant of the block changed its sign within a step."""
@@ -72,8 +71,18 @@ def sine():
     return compiled(Sine(EqnEnv(), "c"))
 
 
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("kind, said", [(Sine, "sin(x)"), (Slider, "x**2 + y**2"), (Turning, "z**2")])
+SAID = {Sine: "sin(x)", Slider: "x**2 + y**2", Turning: "z**2"}
+QUICK = {(Turning, "default")}
+
+
+@pytest.mark.parametrize(
+    "kind, said, way",
+    [
+        pytest.param(kind, said, way, marks=() if (kind, way) in QUICK else pytest.mark.slow)
+        for kind, said in SAID.items()
+        for way in WAYS
+    ],
+)
 def test_refused_at_the_time_by_its_equation(kind, said, way):
     """Kind: a run that goes on where its equations have no solution. The sine ended "successful" at x = 422 (Tsit5) and
     −67 (Rodas5P): one Gauss–Newton step after each step of the solver led somewhere, and nobody looked how far."""
@@ -89,7 +98,7 @@ def test_refused_at_the_time_by_its_equation(kind, said, way):
     assert solution.counts["num_rejected_steps"] < 1000  # one that steps in place rejects half of 16,384
 
 
-@pytest.mark.long("batches by four solvers")
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_members_fail_by_themselves(sine, way):
     """Kind: the same inside jit and vmap."""
@@ -109,6 +118,7 @@ def test_members_fail_by_themselves(sine, way):
     assert np.isnan(x[1, 1])
 
 
+@pytest.mark.slow
 def test_states_that_are_not_finite_are_no_success():
     """Kind: prescribed steps have no error that rejects them; a run of them through a pole was "successful"."""
 

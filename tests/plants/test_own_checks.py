@@ -67,6 +67,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow if c == "root" else ()) for c in CASES])
 def test_a_check_in_a_compiled_model(checked, case):
     message, t1, initial, inputs = CASES[case]
@@ -80,6 +81,7 @@ def test_a_check_in_a_compiled_model(checked, case):
             jax.block_until_ready(run(1.0))
 
 
+@pytest.mark.slow
 def test_users_jitted_functions_keep_their_checks(checked):
     """They were traced inside: JAX keeps such a trace for the whole process."""
     found = simulate(checked, 0.5, ts=TS / 2, solver=diffrax.Tsit5())["c.x"]

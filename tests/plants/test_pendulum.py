@@ -88,6 +88,7 @@ def test_full_swings_pass_both_charts_singular_points(plain):
     assert np.max(np.abs(solution.constraint_residual())) <= 1e-11
 
 
+@pytest.mark.slow
 def test_projection_after_every_step_keeps_loose_solves_useful(plain):
     """Projecting the saved values alone, the states between having drifted, would leave an error of 0.6 m here."""
     ts = np.linspace(0.0, 20.0, 401)

@@ -69,6 +69,7 @@ def test_systems(name):
         assert len(traced) == 1  # equal as a key: the later calls found the first one's program
 
 
+@pytest.mark.slow
 def test_solutions():
     system = rc_circuit()
     solution = simulate(system, 1.0, ts=jnp.array([0.0, 0.5, 1.0]), adjoint=diffrax.ForwardMode())

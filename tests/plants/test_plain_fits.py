@@ -50,7 +50,7 @@ def record(a=0.3, seed=0, **given):
     return learning.Experiment(TS, {"c.x": x + noise}, **{"sigma": NOISE} | given)
 
 
-@pytest.mark.long("residuals alone")
+@pytest.mark.slow
 def test_a_network_begins_silent_unless_it_says_something():
     """A network drawn at random took runs anywhere; one that was trained before is kept."""
 
@@ -73,7 +73,7 @@ def test_a_network_begins_silent_unless_it_says_something():
     np.testing.assert_array_equal(beginning(objective, good, good)[0], good)
 
 
-@pytest.mark.long("residuals with and without their Jacobian")
+@pytest.mark.slow
 def test_a_plain_fit_of_a_network_is_right_and_says_so():
     fit = learning.Problem(system(), record(), train=["c.f"]).fit()
     assert fit.ok and fit.minimum.converged and not fit.reasons
@@ -112,7 +112,7 @@ class Spring(Component):
         self.add_equations(Eq(der(x), v), Eq(der(v), f - d * v))
 
 
-@pytest.mark.long("residuals with and without their Jacobian, three fits")
+@pytest.mark.slow
 def test_a_fit_from_coarse_to_fine_finds_a_law_that_bends():
     """Fits of a hardening spring ended in a linear law, χ² twelve times the freedom: over the first samples, priors had
     shrunk all layers to where tanh is linear."""
@@ -168,7 +168,7 @@ class InUnits(Component):
         self.add_equations(Eq(u, k * v + o), Eq(der(x), v), Eq(der(v), f * force - x))
 
 
-@pytest.mark.long("residuals with and without their Jacobian, four fits")
+@pytest.mark.slow
 def test_units_of_a_network_s_inputs_and_outputs_do_not_matter():
     """An input in mm/s saturated every hidden unit, and the search did not end. One with an offset of 300 half ranges
     was lost (21 %): its bias and its weights did the same."""

@@ -87,6 +87,7 @@ print("done")
 """
 
 
+@pytest.mark.slow
 def test_importing_changes_nothing():
     assert run(IMPORT).strip().startswith(str(ROOT))
 
@@ -136,7 +137,7 @@ print("all four")
 """
 
 
-@pytest.mark.long("a process of its own, which compiles the programs of four methods")
+@pytest.mark.slow
 def test_every_method_fits_in_single_precision():
     """Predictions one step ahead crashed, in any precision, and no fit but that of runs had been tried in single."""
     assert "all four" in run(FITS)

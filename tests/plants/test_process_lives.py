@@ -100,7 +100,7 @@ def test_derivatives_of_a_start(compilations):
     assert not compilations
 
 
-@pytest.mark.long("two programs that go back")
+@pytest.mark.slow
 def test_runs_that_are_longer_than_their_record():
     """Whether a run is made again, piece by piece, is known before its derivative is compiled: a derivative of one that
     fits into its record has no steps to make again, and is not used for a longer one."""

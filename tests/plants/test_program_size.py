@@ -57,7 +57,7 @@ MODELS = {
 }
 
 
-@pytest.mark.long("programs are traced and lowered, not compiled")
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_copies_of_the_field(model, monkeypatch):
     """A pendulum's field stood 11 times in its run and 31 times in the gradient, later 3 and 11 times."""
@@ -103,7 +103,7 @@ class Ramp:
         return self.slope * t
 
 
-@pytest.mark.long("programs are traced and lowered, not compiled")
+@pytest.mark.slow
 def test_functions_of_the_user_are_read_anew():
     """What is traced once is so within one program: an input that has changed counts in the next one, whether or not
     it has a hash."""

@@ -247,6 +247,7 @@ def check_chains(chains):
     np.testing.assert_allclose(np.asarray(slope)[order], np.concatenate(b), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=2, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(several(chains()))
 def test_equations_of_chains(chains):
@@ -282,6 +283,7 @@ TS = np.array([0.7, 1.5])
 VARIED = ["m0.m", "m1.m", "m2.m", "s0_0.c", "s0_1.c", "s1_0.c", "s2_0.c"]
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=15)
 @hypothesis.given(
     st.lists(values, min_size=3, max_size=3),

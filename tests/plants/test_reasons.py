@@ -49,6 +49,7 @@ def test_steps_say_why_they_stopped(blowup):
         minimize(outside, loss, optax.sgd(2.0), 4, train="c.p", progress=False)
 
 
+@pytest.mark.slow
 def test_a_sweep_says_where_and_why(blowup):
     values = {"c.p": jnp.array([0.2, 1.5, 1.8])}
     message = rf"2 of 3 values of the sweep failed, the first at c\.p = 1\.5: .*{ESCAPE}"
@@ -63,7 +64,7 @@ def test_a_sweep_says_where_and_why(blowup):
     eqx.filter_jit(lambda v: sweep(blowup, {"c.p": v}, read).values)(values["c.p"])  # inside a program: no error
 
 
-@pytest.mark.long("a run with an event is compiled")
+@pytest.mark.slow
 def test_an_event_that_writes_no_number_is_not_stiffness():
     """Both ended with one code, so the run was made once more with an implicit solver, and called stiff."""
 

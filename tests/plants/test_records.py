@@ -99,7 +99,7 @@ def restricted(parts):
     return a, sigma
 
 
-@pytest.mark.long("residuals and their Jacobian of two experiments")
+@pytest.mark.slow
 def test_a_weight_counts_as_often_as_it_says():
     """Noise levels and degrees of freedom took every record once, whatever its weight."""
     rng = np.random.default_rng(0)
@@ -130,7 +130,7 @@ def test_a_weight_counts_as_often_as_it_says():
     assert ends[1] < row.low / row.value < ends[0] and ends[2] < row.high / row.value < ends[3]
 
 
-@pytest.mark.long("residuals and their Jacobian of two experiments")
+@pytest.mark.slow
 @pytest.mark.parametrize("held_out", [False, True])
 def test_of_several_starts_the_most_likely_is_kept(held_out):
     """Each local minimum with its own noise level costs half its degrees of freedom, so that the best was drawn by
@@ -152,11 +152,8 @@ def test_of_several_starts_the_most_likely_is_kept(held_out):
     assert fit.sigma["c.x"] == pytest.approx(np.sqrt(misfit(best) / (len(both[1]) - 1)), rel=1e-6)
 
 
-LONG = pytest.mark.long("two programs of residuals with their Jacobian")
-CHEAP = {name: LONG if name in ("weight", "minibatches") else pytest.mark.slow for name in WAYS}
-
-
-@pytest.mark.parametrize("what", [pytest.param(name, marks=mark) for name, mark in CHEAP.items()])
+@pytest.mark.slow
+@pytest.mark.parametrize("what", WAYS)
 def test_how_records_are_written_does_not_matter(what):
     """Weights and padding changed intervals, noise levels and degrees of freedom; a sensor law saw the rows by which a
     record is padded to the length of another; a sample at the start was refused; a batch was weighed by its own number

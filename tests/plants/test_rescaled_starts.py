@@ -16,6 +16,7 @@ def test_verdicts_and_states_with_networks(name, kind):
     compare_verdicts(*outcome(MODELS[name]), kind, seed=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, kind", [pytest.param("implicit", "all", marks=pytest.mark.slow), ("contradiction", "units")]
 )

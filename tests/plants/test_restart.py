@@ -111,6 +111,7 @@ def from_there():
     return names, jax.tree.map(np.asarray, run(states))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["room", "ball", "loop", "bob", "counter", "clutch", "one", "tank", "diode"])
 def test_a_run_in_two_parts_is_the_run_in_one_go(part):
     names, (values, _, _) = from_there()
@@ -124,6 +125,7 @@ def test_a_run_in_two_parts_is_the_run_in_one_go(part):
         np.testing.assert_allclose(rows[seen][:, chosen], known[seen], rtol=0, atol=1e-7, err_msg=f"from {place}")
 
 
+@pytest.mark.slow
 def test_events_go_on():
     """Those of the second run are those of the one run after the time at which it began. (One at that time, found some
     roundings later, is in the second run; that none happens twice is seen by the counters above.)"""
@@ -141,6 +143,7 @@ def sampled():
     return compiled(SampledPI(EqnEnv(), "c"))
 
 
+@pytest.mark.slow
 def test_a_loop_of_restarts():
     """A scan whose carry is the whole state, with steps that begin at ticks and between them; and its gradient, which
     is that of the run in one go."""
@@ -167,6 +170,7 @@ def test_a_loop_of_restarts():
     np.testing.assert_allclose(found[1], known[1], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_an_input_that_is_another_one_after_the_restart():
     """Relations that its value turns have turned when the run goes on, at the first row, too; conditions that it makes
     true are events."""
@@ -183,6 +187,13 @@ def test_an_input_that_is_another_one_after_the_restart():
     np.testing.assert_allclose(again["c.y"], [2.0, 2.0])
     np.testing.assert_allclose(again["c.x"], [1.0, 13.0])
     assert len(again.events) == 1 and float(again.events.ts[0]) == 1.0
+
+
+def built_of(name):
+    def write(c, ev):
+        c.add_equations(Eq(der(c.variable(name, start=1.0, fixed=True)), 0))
+
+    return compiled(component(write))
 
 
 def test_what_cannot_be_a_whole_state():
@@ -202,6 +213,10 @@ def test_what_cannot_be_a_whole_state():
         simulate(system, 1.0, initial=dataclasses.replace(state, x=state.x * jnp.nan))
     with pytest.raises(ModelError, match="3 saved times"):
         solution.at(3)
+    # One of another model with as many states went on, with one model's numbers for the other's.
+    foreign = dataclasses.replace(state, of=built_of("other").plan.digest_of_states)
+    with pytest.raises(ModelError, match=r"one of another model: here, it has c\.\w"):
+        simulate(system, 1.0, initial=foreign)
     # Inside jit, a time that is not the state's: not-a-number and a code.
     run = jax.jit(lambda t0: simulate(system, 1.0, t0=t0, ts=jnp.array([1.0]), initial=state).states)
     assert np.isfinite(run(0.5)).all() and np.isnan(run(0.25)).all()
@@ -209,6 +224,7 @@ def test_what_cannot_be_a_whole_state():
     assert np.isfinite(moved.states).all()
 
 
+@pytest.mark.slow
 def test_another_time_where_constraints_come_and_go():
     """Kind: a verdict that a later one replaces. Inside jit, a time that was not the state's went unnoticed in models
     with such constraints, whose own check took its place."""
@@ -219,6 +235,7 @@ def test_another_time_where_constraints_come_and_go():
     assert np.isfinite(run(0.05)).all() and np.isnan(run(0.02)).all()
 
 
+@pytest.mark.slow
 def test_a_batch_of_states():
     """`filter_vmap` returns a batch of solutions, whose `at` is a batch of states."""
     system = sampled()
@@ -248,7 +265,7 @@ class Rectified(Component):
         self.complementary(-v, i)
 
 
-@pytest.mark.long("runs with events are compiled")
+@pytest.mark.slow
 def test_from_the_instant_at_which_a_diode_blocks():
     """Kind: a guard inside its band that falls was neither due nor below: a run that went on from the instant of the
     event, or a nanosecond before or after it, took steps of length zero."""

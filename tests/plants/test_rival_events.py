@@ -42,7 +42,7 @@ def system(kind, order=1):
     ("discretes", "c.k", "2*x >= 2"), ("states", "c.x", "2*x >= 2"), ("clock", "c.k", "sampled")
 ])  # fmt: skip
 @pytest.mark.parametrize("order", [1, -1])
-@pytest.mark.long("a run with events is compiled")
+@pytest.mark.slow
 def test_contradictions_are_refused(kind, what, other, order):
     """Kind: the order of declaration. The event that was handled last won."""
     with pytest.raises(
@@ -52,21 +52,21 @@ def test_contradictions_are_refused(kind, what, other, order):
     assert all(text in str(error.value) for text in (what, "c: when(x >= 1)", other))
 
 
-@pytest.mark.long("a run with events is compiled")
+@pytest.mark.slow
 def test_at_the_start_too():
     """The instant is that of the start."""
     with pytest.raises(SimulationError, match=r"stopped at t=0: 'c: when\(x <= 0\)' and 'c: when\(x >= 0\)' happen"):
         simulate(system("start"), 0.5, ts=TS[:1])
 
 
-@pytest.mark.long("a run with events is compiled")
+@pytest.mark.slow
 def test_events_in_turn_do_not_contradict_each_other():
     """What an event causes comes after it, and counts; so do two events that agree."""
     agreeing = system("in turn").with_parameters({"c.b": 1.0})
     np.testing.assert_array_equal(simulate(agreeing, 2.0, ts=TS)["c.k"], [0, 5, 5])
 
 
-@pytest.mark.long("a batch of runs with events is compiled")
+@pytest.mark.slow
 def test_a_member_that_contradicts_itself_fails_alone():
     """In batches, the member is not-a-number from the instant on, and has a result code."""
 

@@ -24,7 +24,7 @@ def run(system, ts):
     return simulate(system, float(ts[-1]), ts=jnp.asarray(ts), rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.long("a run and a gradient through it")
+@pytest.mark.slow
 def test_a_circuit_by_connections_and_its_gradient_by_a_parameter_of_others():
     """`scale` is the parameter that R = scale / 2 depends on; C v' = (V - v) / R from t = 0.5 s on."""
     system = compiled("Circuits.RC")

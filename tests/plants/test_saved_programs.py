@@ -44,7 +44,7 @@ def end(R):
     return simulate(system, 2.0, ts=TS, solver=solvers.Rodas5P(), throw=False)["c.v"][-1]
 
 
-@pytest.mark.long("a run and its gradient are compiled, and a second process loads them")
+@pytest.mark.slow
 def test_a_run_and_its_gradient_in_another_process(tmp_path):
     """The other process compiles nothing, and does not crash where LAPACK is called. Values are those of the first
     process, to the last bit, and those of the closed form."""

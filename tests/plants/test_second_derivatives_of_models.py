@@ -39,6 +39,7 @@ class Cubic(Component):
         self.add_equations(Eq(der(x), -x), Eq(y, x**3 + x))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "twice",
     [jax.hessian, pytest.param(lambda f: jax.jacfwd(jax.jacfwd(f)), marks=pytest.mark.slow)],

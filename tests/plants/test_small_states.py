@@ -37,13 +37,14 @@ def test_oscillations_of_any_size(oscillator, w, x0):
     np.testing.assert_allclose(found / x0, np.cos(TS), rtol=0, atol=2e-4)
 
 
-@pytest.mark.long("two stiff solvers")
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [Rodas5P(), BDF()])
 def test_by_solvers_of_stiff_models(oscillator, solver):
     found = simulate(oscillator, TS[-1], ts=TS, solver=solver)["c.x"]
     np.testing.assert_allclose(found / 1e-9, np.cos(TS), rtol=0, atol=5e-3 if isinstance(solver, BDF) else 2e-4)
 
 
+@pytest.mark.slow
 def test_inside_jit_sizes_are_those_of_the_system(oscillator):
     found = jax.jit(lambda w: simulate(oscillator.with_parameters({"c.w": w}), TS[-1], ts=jnp.array(TS))["c.x"])(1.0)
     np.testing.assert_allclose(found / 1e-9, np.cos(TS), rtol=0, atol=2e-4)
@@ -56,6 +57,7 @@ def test_sizes_between_a_state_and_its_acceleration(oscillator):
     assert 2e-4 < size["c.v"] < 5e-3
 
 
+@pytest.mark.slow
 def test_a_start_that_is_rounding_tells_no_size():
     """L·cos(π/2) = 6e-17 is no size of x. A pendulum that begins upright stays there, or falls; its steps must not be
     those of a motion of 1e-16."""

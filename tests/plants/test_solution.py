@@ -30,6 +30,7 @@ def solution(system):
 # --- names -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_variables_by_name(solution):
     x, v = damped_oscillation(np.asarray(TS))
     assert isinstance(solution, Solution) and isinstance(solution.system, AcausalSystem)
@@ -103,6 +104,7 @@ def test_a_solution_is_a_pytree(solution):
     assert "3 times" in repr(solution)
 
 
+@pytest.mark.slow
 def test_solutions_may_leave_jit(system):
     @eqx.filter_jit
     def run(x0):
@@ -126,6 +128,7 @@ def test_stats_and_result(solution):
 # --- saved times -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_without_times_every_step_is_saved(system):
     solution = simulate(system, 1.1, rtol=1e-9, atol=1e-11)
     t = np.asarray(solution.ts)
@@ -185,6 +188,7 @@ def blowup():
     return compiled(Blowup(EqnEnv(), "c"))
 
 
+@pytest.mark.slow
 def test_failure_without_throw_keeps_what_was_reached(blowup):
     ts = jnp.array([0.3, 0.6, 0.9, 1.2, 1.5])
     solution = simulate(blowup, 1.5, ts=ts, max_steps=200, throw=False)
@@ -208,6 +212,7 @@ def test_every_step_saved_up_to_a_failure(blowup):
     np.testing.assert_allclose(solution["c.x"], 1 / (1 - t), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_failures_in_a_batch_are_told_apart(blowup):
     """x = x₀/(1 − x₀·t): of three members one does not reach t = 1.5."""
 
@@ -346,6 +351,7 @@ def test_a_model_of_zeros_is_observed():
     np.testing.assert_array_equal(solution_of(system, [0.5, 1.0], np.zeros((2, 0)))["c.y"], [0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_quantities_are_read_in_blocks_of_times(monkeypatch):
     """Kind: what is read costs what was not asked for. One algebraic variable of a large model was all quantities at
     all times: 0.8 GB for 8 kB. Blocks give the same numbers, the last one shorter too."""

@@ -64,6 +64,7 @@ def solution():
     return simulate(system, ts[-1], ts=ts, rtol=1e-9, atol=1e-12, adjoint=diffrax.ForwardMode())
 
 
+@pytest.mark.slow
 def test_guesses_choose_slopes_at_the_start():
     ev = EqnEnv()
     system = compiled(*(Branches(ev, f"c{k}", guess) for k, guess in enumerate(GUESSES)))
@@ -85,6 +86,7 @@ def test_a_parent_starts_the_derivative_of_a_child(solution):
     assert float(solution["o.inside.x"][-1]) == pytest.approx(2.0, rel=1e-7)  # 2 sin t; a hundred times the tolerance
 
 
+@pytest.mark.slow
 def test_a_derivative_without_a_name_is_fixed():
     system = compiled(SecondOrder(EqnEnv(), "p"))
     assert system.variables == ["p.x", "p.y", "p.tension"]

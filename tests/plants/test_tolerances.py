@@ -53,7 +53,7 @@ def test_variables_under_error_control(volume, options):
     np.testing.assert_allclose(p, 5e5, rtol=1e-5)
 
 
-@pytest.mark.long("a gradient")
+@pytest.mark.slow
 def test_inside_jit_and_grad(volume):
     """The pressure at the end is that of the source, whatever β."""
 

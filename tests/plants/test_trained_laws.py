@@ -22,24 +22,26 @@ from jaxonomy_dae.learning import (
     Problem,
 )
 
-KEYS = iter(jax.random.split(jax.random.key(4), 9))
 SMALL = {"width": 6, "depth": 1}
 NOISE = 1e-2
 TIMES = np.linspace(0.0, 3.0, 61)[1:]
 
-# By law: the network, its states and their starts; x' = law(x) but where said below. Truths are of other forms than the
-# networks.
-ZOO = {
-    "passive": (Passive(key=next(KEYS), inputs=2.0, power=4.0, **SMALL), {"a": 2.0}),
-    "isotropic": (IsotropicPassive(2, key=next(KEYS), inputs=2.0, power=4.0, **SMALL), {"b": 2.0, "c": -0.5}),
-    "dissipation": (Dissipation(2, key=next(KEYS)), {"d": 1.0, "e": 0.5}),
-    "port": (PortHamiltonian(2, key=next(KEYS), **SMALL), {"f": 1.0, "g": 0.0}),
-    "conservative": (Conservative(1, key=next(KEYS), **SMALL), {"h": 1.0, "i": 0.0}),  # h' = i, i' = law(h)
-    "odd": (Odd(key=next(KEYS), **SMALL), {"j": 1.5}),
-    "monotone": (Monotone(1, 1, False, key=next(KEYS), width=6), {"k": 2.0}),
-    "bounded": (Bounded(-2.0, 0.0, key=next(KEYS), **SMALL), {"m": 2.0}),
-    "positive": (Positive(key=next(KEYS), **SMALL), {"n": 0.1}),
-}
+
+def zoo():
+    """By law: the network, its states and their starts; x' = law(x) but where said below. Truths are of other forms
+    than the networks."""
+    keys = iter(jax.random.split(jax.random.key(4), 9))
+    return {
+        "passive": (Passive(key=next(keys), inputs=2.0, power=4.0, **SMALL), {"a": 2.0}),
+        "isotropic": (IsotropicPassive(2, key=next(keys), inputs=2.0, power=4.0, **SMALL), {"b": 2.0, "c": -0.5}),
+        "dissipation": (Dissipation(2, key=next(keys)), {"d": 1.0, "e": 0.5}),
+        "port": (PortHamiltonian(2, key=next(keys), **SMALL), {"f": 1.0, "g": 0.0}),
+        "conservative": (Conservative(1, key=next(keys), **SMALL), {"h": 1.0, "i": 0.0}),  # h' = i, i' = law(h)
+        "odd": (Odd(key=next(keys), **SMALL), {"j": 1.5}),
+        "monotone": (Monotone(1, 1, False, key=next(keys), width=6), {"k": 2.0}),
+        "bounded": (Bounded(-2.0, 0.0, key=next(keys), **SMALL), {"m": 2.0}),
+        "positive": (Positive(key=next(keys), **SMALL), {"n": 0.1}),
+    }
 
 
 def truth(t, s):
@@ -55,9 +57,9 @@ def truth(t, s):
 class Zoo(Component):
     """Systems that know nothing of each other."""
 
-    def __init__(self, ev):
+    def __init__(self, ev, laws):
         super().__init__(ev, "z")
-        for name, (law, starts) in ZOO.items():
+        for name, (law, starts) in laws.items():
             x = [self.variable(n, start=s, fixed=True) for n, s in starts.items()]
             found = self.learned(name, law, x[:1] if name == "conservative" else x)
             right = (x[1], *found) if name == "conservative" else found
@@ -66,14 +68,15 @@ class Zoo(Component):
 
 @pytest.mark.slow
 def test_every_law_is_learned_from_noise():
-    names = [n for _, starts in ZOO.values() for n in starts]
-    starts = [s for _, starts in ZOO.values() for s in starts.values()]
+    laws = zoo()
+    names = [n for _, starts in laws.values() for n in starts]
+    starts = [s for _, starts in laws.values() for s in starts.values()]
     clean = scipy.integrate.solve_ivp(truth, (0, 3), starts, "DOP853", TIMES, rtol=1e-11, atol=1e-12).y
     rng = np.random.default_rng(0)
     data = {f"z.{n}": x + NOISE * rng.standard_normal(len(TIMES)) for n, x in zip(names, clean, strict=True)}
-    fit = Problem(compiled(Zoo(EqnEnv())), Experiment(TIMES, data, sigma=NOISE)).fit(adam=100)
+    fit = Problem(compiled(Zoo(EqnEnv(), laws)), Experiment(TIMES, data, sigma=NOISE)).fit(adam=100)
     assert fit.minimum.converged and 0.85 < fit.chi2 / fit.freedom < 1.15
-    assert all(1 <= fit.effective[f"z.{name}"] <= 20 for name in ZOO)  # of 4 to 60 weights
+    assert all(1 <= fit.effective[f"z.{name}"] <= 20 for name in laws)  # of 4 to 60 weights
     predicted = fit.predict([f"z.{n}" for n in names])
     for name, x in zip(names, clean, strict=True):
         error = predicted.mean[f"z.{name}"] - x

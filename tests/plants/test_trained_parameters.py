@@ -143,6 +143,7 @@ def test_least_squares_end_inside_bounds():
     assert ["bound reached" in table[name].note for name in names] == at_end.tolist()
 
 
+@pytest.mark.slow
 def test_gradient_steps_end_inside_bounds():
     """All at once: the squares of the parameters' distances from their targets know nothing of each other."""
     system, names = lines()

@@ -66,7 +66,7 @@ def training():
     return losses, first
 
 
-@pytest.mark.long("the gradient of the tutorial's network")
+@pytest.mark.slow
 def test_initial_loss_and_gradient_are_the_tutorials(training):
     # 1e-4 relative throughout: the tutorial's BDF at rtol 1e-7 against Tsit5 at 1e-7 differ by some 1e-5.
     losses, gradient = training

@@ -61,7 +61,7 @@ def of_start(a, y, rows=slice(None)):
     return x0, NOISE**2 / (e @ e), by_a
 
 
-@pytest.mark.long("residuals and their Jacobian, of three experiments and of one")
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [None, 4])
 def test_new_data_are_predicted_with_a_start_of_their_own(first):
     """The start is that of least squares with the rate as found; the band holds what it and the rate leave open."""
@@ -87,7 +87,7 @@ def test_new_data_are_predicted_with_a_start_of_their_own(first):
     np.testing.assert_allclose(found.spread["c.x"], expected, rtol=1e-3)
 
 
-@pytest.mark.long("residuals and their Jacobian")
+@pytest.mark.slow
 def test_a_known_start_is_taken():
     a = fit().values["c.a"]
     new = record(1.5, 9, initial={"c.x": 1.5}, sigma="estimate")

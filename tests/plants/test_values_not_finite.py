@@ -57,7 +57,7 @@ def test_a_variable_that_is_not_finite_is_refused_where_it_is_read():
         solution.energy()
 
 
-@pytest.mark.long("runs with an event are compiled")
+@pytest.mark.slow
 def test_in_batches_and_in_jit_it_is_not_a_number():
     """A member that fails does so alone; the warning outside of jit names it. With `throw=False` nothing is raised."""
     reached = 2 * np.sqrt(1.1 - np.asarray(TS[:3])) + 1
@@ -100,7 +100,7 @@ def _jumps(t):
     ("position", "friction", "mode"),
     [(_rests, [2, 2, 0, -2], [1, 1, 0, -1]), (_jumps, [0, 0, 2, 0], [0, 0, 1, 0])],
 )
-@pytest.mark.long("runs with events are compiled")
+@pytest.mark.slow
 def test_prescribed_motion_that_rests_on_friction(position, friction, mode):
     """Kind: a mode that does not determine a variable. The friction of parts that a source holds at rest was 0/0; it is
     zero, and slides as soon as the source moves on, also where it jumps to a speed or onto rest."""
@@ -113,7 +113,7 @@ def test_prescribed_motion_that_rests_on_friction(position, friction, mode):
     np.testing.assert_array_equal(solution["rubs.mode"], mode)
 
 
-@pytest.mark.long("a run with events is compiled")
+@pytest.mark.slow
 def test_a_brake_on_a_shaft_that_samples_move():
     """The same with samples as the input of a source: rest, a turn forth and back, rest."""
     ev = EqnEnv()

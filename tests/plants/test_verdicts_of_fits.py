@@ -33,7 +33,7 @@ def truth(cubic=0.0):
     return scipy.integrate.solve_ivp(field, (0, 10), [1, 0], t_eval=TS, rtol=1e-10, atol=1e-12).y
 
 
-@pytest.mark.long("residuals and their Jacobian, and a hundred fits of 20 ms")
+@pytest.mark.slow
 def test_small_errors_of_a_model_are_noticed_and_right_models_are_not_doubted():
     """What a wrong spring leaves of 0.3 σ, or a slow input of 0.3 σ, passed in three of four fits, and a mode of half
     the noise in two of five."""

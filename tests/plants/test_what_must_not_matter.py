@@ -27,6 +27,7 @@ def model(build):
     return AcausalCompiler(ev, AcausalDiagram().add(Part(ev)))()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Tsit5, Rodas5P, BDF])
 def test_the_solver_of_a_model_without_states(solver):
     """The solver: with BDF, a model without states was an error of JAX, since its Jacobian has no rows."""
@@ -35,7 +36,7 @@ def test_the_solver_of_a_model_without_states(solver):
     np.testing.assert_allclose(solution["c.y"], np.sin([0.5, 1.0]), rtol=1e-12)
 
 
-@pytest.mark.long("the names together, one by one, and in a batch are programs of their own")
+@pytest.mark.slow
 def test_rows_that_were_not_reached():
     """Whether a variable depends on the state: constants, functions of time and zeros had values in rows that a run did
     not reach, where all else is not-a-number."""
@@ -58,6 +59,7 @@ def test_rows_that_were_not_reached():
     assert np.isnan(together).all() and np.isnan(apart).all()
 
 
+@pytest.mark.slow
 def test_how_a_number_is_written():
     """The type of a number: what a declaration takes for a number was an error of JAX in `with_parameters` and
     `initial`; an empty list of jumps was one of Diffrax."""
@@ -92,7 +94,7 @@ def test_which_numbers_were_written_before():
         compiled(True)
 
 
-@pytest.mark.long("a run, and its start")
+@pytest.mark.slow
 def test_whose_arrays_weights_are():
     """The library of an array: weights of NumPy were an error of the programs that are kept for the next process."""
 

@@ -207,7 +207,8 @@ def array(shape: Any = 2, **changed: Any) -> Callable:
             k, x = self.parameter("k", k), self.variable("x", start=start, fixed=True)
             self.add_equations(Eq(der(x), -k * x))
 
-    return lambda self: self.add_array(changed.pop("name", "cell"), Cell, shape, **changed)
+    more = {key: value for key, value in changed.items() if key != "name"}
+    return lambda self: self.add_array(changed.get("name", "cell"), Cell, shape, **more)
 
 
 def outputs(name: str = "o", factor: float = 2.0, unit: str = "") -> Callable:

@@ -67,11 +67,11 @@ def _sizes_by_count(sizes: Any) -> Any:
     return bent
 
 
-def _always_well(traced: Any) -> Any:
+def _always_well(run: Any) -> Any:
     import diffrax
 
-    def bent(outcome: Any, *rest: Any) -> Any:
-        return traced(dataclasses.replace(outcome, result=diffrax.RESULTS.successful), *rest)
+    def bent(*args: Any, **options: Any) -> Any:
+        return dataclasses.replace(run(*args, **options), result=diffrax.RESULTS.successful)
 
     return bent
 
@@ -212,36 +212,39 @@ def _size_of_start(c: Any) -> dict[str, Any]:
 
 
 FAULTS = (
-    Planted("a", 1, "bounds are no part of a model's identity", "model.identity:_Walk._of", forgets("Interval")),
-    Planted("a", 17, "models with the same names are the same", "lowering.plan:SystemPlan._identity", _by_names),
-    Planted("a", 17, "typical sizes are kept by how many there are", "system.acausal_compiler:typical_sizes", 
+    Planted("a", 1, "bounds are no part of a model's identity", "compile.model.identity:_Walk._of",
+            forgets("Interval")),
+    Planted("a", 17, "models with the same names are the same", "compile.lowering.plan:SystemPlan._identity",
+            _by_names),
+    Planted("a", 17, "typical sizes are kept by how many there are", "run.system.acausal_compiler:typical_sizes",
             _sizes_by_count),
-    Planted("b", 100, "parameters that are traced are off", "system.system:AcausalSystem.with_parameters",
+    Planted("b", 100, "parameters that are traced are off", "run.system.system:AcausalSystem.with_parameters",
             _off_inside),
-    Planted("b", 100, "inside jit, all runs end well", "simulation.simulate:_traced", _always_well),
-    Planted("b", 100, "tolerances are looser inside jit", "simulation.simulate:controller_for", _looser_inside),
-    Planted("c", 2, "the parameter declared first is off", "system.acausal_compiler:AcausalCompiler.__call__",
+    Planted("b", 100, "inside jit, all runs end well", "run.simulation.simulate:run", _always_well),
+    Planted("b", 100, "tolerances are looser inside jit", "run.simulation.simulate:controller_for", _looser_inside),
+    Planted("c", 2, "the parameter declared first is off", "run.system.acausal_compiler:AcausalCompiler.__call__",
             _parameter_bent(lambda names: 0)),
-    Planted("c", 9, "the parameter that is first by name is off", "system.acausal_compiler:AcausalCompiler.__call__",
+    Planted("c", 9, "the parameter that is first by name is off",
+            "run.system.acausal_compiler:AcausalCompiler.__call__",
             _parameter_bent(lambda names: names.index(min(names)))),
-    Planted("d", 8, "discrete variables start again", "simulation.solution:Solution.at", _at(_starts_again)),
-    Planted("d", 0, "a saved state is off", "simulation.solution:Solution.at", _at(_row_before)),
-    Planted("d", 1, "clocks forget what has ticked", "simulation.solution:Solution.at", _at(_tocked)),
-    Planted("e", 22, "small starts are zero", "system.system:AcausalSystem.initialize", _no_small_values),
-    Planted("e", 21, "nominal values scale no tolerance", "simulation.step_sizes:scaled_atol",
+    Planted("d", 8, "discrete variables start again", "run.simulation.solution:Solution.at", _at(_starts_again)),
+    Planted("d", 0, "a saved state is off", "run.simulation.solution:Solution.at", _at(_row_before)),
+    Planted("d", 1, "clocks forget what has ticked", "run.simulation.solution:Solution.at", _at(_tocked)),
+    Planted("e", 22, "small starts are zero", "run.system.system:AcausalSystem.initialize", _no_small_values),
+    Planted("e", 21, "nominal values scale no tolerance", "run.simulation.step_sizes:scaled_atol",
             lambda _: lambda system, atol: atol),
     Planted("f", 0, "a weight counts in residuals alone", "learning.objective:Objective.weights", _share_of_one),
     Planted("f", 1, "missing samples are zeros", "learning.problem:stack", _missing_are_zero),
     Planted("g", 0, "priors begin where the search does", "learning.problem:as_asked",
             _moved_with_start(_centre_at_start)),
     Planted("g", 0, "sizes are those of the start", "learning.problem:as_asked", _moved_with_start(_size_of_start)),
-    Planted("h", 2, "slopes hang on how many parameters there are", "system.system:AcausalSystem.vector_field",
+    Planted("h", 2, "slopes hang on how many parameters there are", "run.system.system:AcausalSystem.vector_field",
             _by_count(lambda system: len(system.parameters.names))),
-    Planted("h", 1, "slopes hang on how many variables there are", "system.system:AcausalSystem.vector_field",
+    Planted("h", 1, "slopes hang on how many variables there are", "run.system.system:AcausalSystem.vector_field",
             _by_count(lambda system: len(system.variables))),
-    Planted("i", 38, "BDF keeps to no tolerance", "solvers.bdf:CAUTION", lambda _: 1e-7),
-    Planted("i", 100, "steps of Rodas5P are off", "solvers.rodas5p:Rodas5P.step", _step_off),
-    Planted("i", 100, "between steps, Tsit5 is off", "solvers.tsit5:Tsit5.step", _dense_off),
+    Planted("i", 38, "BDF keeps to no tolerance", "solve.methods.bdf:CAUTION", lambda _: 1e-7),
+    Planted("i", 100, "steps of Rodas5P are off", "solve.methods.rodas5p:Rodas5P.step", _step_off),
+    Planted("i", 100, "between steps, Tsit5 is off", "solve.methods.tsit5:Tsit5.step", _dense_off),
 )  # fmt: skip
 
 

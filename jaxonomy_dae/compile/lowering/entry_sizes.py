@@ -18,6 +18,7 @@ class EntrySizes:
     def __init__(self, model: ReducedModel):
         self.extended = model.extended
         declared = model.flat.declares
+        self._changed = model.flat.parameters.changed_by_events
         guess, _ = start_guess(model, declared.values)
         networks = Networks(tuple(declared.networks.values()))
         points = (guess, guess + quantity_scale(model))
@@ -33,6 +34,19 @@ class EntrySizes:
     def is_number(self, group: int, slot: int) -> bool:
         """True if the entry depends on nothing, parameters included."""
         return self.extended.groups[group].template.coefficient_is_number(slot)
+
+    def may_vanish(self, group: int, slot: int, rows: np.ndarray) -> bool:
+        """True if the entry may be zero in one of these instances, whose equation cannot be solved for the slot then.
+
+        Parameters do not vanish while a model runs, except for those that events change: where a pump is switched off,
+        dp = on·head(m_flow) does not determine the head.
+        """
+        chosen = self.extended.groups[group]
+        if not chosen.template.coefficient_never_vanishes(slot):
+            return True
+        readers = chosen.template.readers_of_partials()[1]
+        read = [k for k, positions in enumerate(readers) if slot in positions]
+        return bool(self._changed[chosen.parameter[np.ix_(rows, read)]].any())
 
     def _evaluated(self, group: int) -> np.ndarray:
         chosen = self.extended.groups[group]

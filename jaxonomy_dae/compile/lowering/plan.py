@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -133,8 +134,9 @@ class SystemPlan:
         """A digest of the structure, the same in every process; functions in it are told apart by names alone."""
         return self._identity.digest
 
-    def told(self) -> tuple[str, tuple[Callable, ...]]:
-        """What is the same in every process: see `programs.lasting`."""
+    def __content__(self) -> tuple[str, tuple[Callable, ...]]:
+        """For `host/content.py`: the digest, which leaves out what functions in the plan compute, and these
+        functions."""
         return self._identity.digest, self._identity.functions
 
     @property
@@ -167,6 +169,13 @@ class SystemPlan:
     def variable_index(self) -> Mapping[str, int]:
         """The number of every variable by name."""
         return self.flat.variables.index
+
+    @functools.cached_property
+    def digest_of_states(self) -> str:
+        """A digest of what the entries of a whole state mean: the names of states and of discrete variables."""
+        names = [self.quantity_name[q] for q in (*self.states, *self.carried)]
+        discrete = () if self.events is None else self.flat.parameters.names[self.events.discrete]
+        return hashlib.sha256(repr((names, list(discrete))).encode()).hexdigest()
 
     @property
     def n_state(self) -> int:

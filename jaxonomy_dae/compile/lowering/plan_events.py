@@ -111,7 +111,7 @@ def plan_events(
         factor=factor,
         discrete=flat.parameters.discrete,
         n_visible=len(flat.parameters.discrete) - flat.parameters.n_relations,
-        dependents=_following(flat),
+        dependents=flat.parameters.follow_events,
         facts=EventFacts(
             flags=tuple(event.flags for event in table.events),
             n_clocks=table.n_clocks,
@@ -255,19 +255,6 @@ def read_variables(
     if not len(chosen):
         return made, NOTHING
     return made, made.layout.gather(quantity, np.where(chosen < 0, 1.0, variables.factor[chosen]))
-
-
-def _following(flat: FlatModel) -> tuple[Formulas, ...]:
-    """The parameters that are expressions in discrete variables, directly or through others."""
-    moved = np.zeros(len(flat.parameters), bool)
-    moved[flat.parameters.discrete] = True
-    found = []
-    for group in flat.parameters.dependents:
-        rows = moved[group.parameter].any(axis=1) & ~moved[group.target]
-        if rows.any():
-            moved[group.target[rows]] = True
-            found.append(group.take(rows))
-    return tuple(found)
 
 
 @dataclasses.dataclass(frozen=True)

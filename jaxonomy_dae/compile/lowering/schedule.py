@@ -337,7 +337,7 @@ def _torn_step(
     entries: dict[tuple[int, int], np.ndarray] = {}
     numbers = set()
     for e, (g, slots) in enumerate(shape):
-        template, inside = extended.groups[g].template, _inside(slots)
+        inside = _inside(slots)
         rows = row_of[[block.equations[e] for block in alike]]
         for k in inside:
             at = (e, slots[k])
@@ -349,7 +349,7 @@ def _torn_step(
         safe = set()
         for u in contains[-1]:
             where = [k for k in inside if slots[k] == u]
-            if len(where) == 1 and template.coefficient_never_vanishes(where[0]):
+            if len(where) == 1 and not entry_sizes.may_vanish(g, where[0], rows):
                 safe.add(u)
         solvable.append(frozenset(safe))
     torn = tear(contains, solvable, BlockSizes(entries, frozenset(numbers)))

@@ -123,6 +123,7 @@ class HeldTable:
     text: tuple[str, ...]  # of each
     active: np.ndarray  # (held,): the variable that is 1 while it holds, and 0 otherwise
     impulse: np.ndarray  # (held,): index of the discrete variable that is 1 while the impulse acts
+    rate: np.ndarray  # (held,): index of the discrete variable that is added to its highest derivative: zero
     force: np.ndarray  # (held,): the variable that is never negative, or −1
     closed: np.ndarray  # (held,): the place among the discrete variables of the one that lets go at 0, or −1
     level: np.ndarray  # (levels,): the variables that are zero while they hold …
@@ -132,4 +133,4 @@ class HeldTable:
         return len(self.text)
 
 
-NONE_HELD = HeldTable((), *(np.zeros(0, np.int64),) * 6)
+NONE_HELD = HeldTable((), *(np.zeros(0, np.int64),) * 7)

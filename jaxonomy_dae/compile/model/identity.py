@@ -2,8 +2,12 @@
 
 Given a tree of records, containers, arrays, templates and texts, returns a digest that two trees share only if they are
 equal in every part, and the functions in them. There is no list of what counts: a record counts with all its fields, an
-array with its dtype, shape and entries, an expression by its canonical form, a function or a class as the object that
-it is. What is of no known type is refused, so that nothing is forgotten.
+array with its dtype, shape and entries, an expression by its canonical form; a function, a class or a callable object
+of the user's as the object that it is. What is of no known type is refused, so that nothing is forgotten.
+
+Two plans are equal if their digests are equal and their functions are the same objects. What these functions compute
+may change while they stay the same objects, so that programs are looked up by their content as well, at each call
+(`host/content.py`).
 """
 
 import dataclasses
@@ -20,12 +24,13 @@ import sympy
 
 from ...base.aliases import PyTree
 from ...graph.expressions.node import Node
+from ...host.libraries import PACKAGE, Owner, owner
 from ...solve.linear.sparse import SparsePattern
 from .provenance import Lines
 from .template import AbstractTemplate
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Identity:
     """The digest of a tree, and the functions and classes in it in the order in which the walk meets them."""
 
@@ -43,11 +48,24 @@ class Identity:
         walk = _Walk()
         return cls(walk.digest(tree).hex(), tuple(walk.functions))
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Identity) and self.digest == other.digest and self._has_those_of(other)
+
+    def _has_those_of(self, other: "Identity") -> bool:
+        pairs = zip(self.functions, other.functions, strict=False)
+        return len(self.functions) == len(other.functions) and all(_is_same(a, b) for a, b in pairs)
+
     def __hash__(self) -> int:
         return hash(self.digest)
 
 
-PACKAGE = __name__.partition(".")[0]
+def _is_same(one: object, other: object) -> bool:
+    """True for one object, or for one method of one object, which Python makes anew whenever it is read."""
+    if isinstance(one, types.MethodType) and isinstance(other, types.MethodType):
+        return one.__func__ is other.__func__ and one.__self__ is other.__self__
+    return one is other
+
+
 _PLAIN = frozenset({type(None), bool, int, float, complex, str, bytes})  # whose `repr` says all
 
 
@@ -98,12 +116,14 @@ class _Walk:
                 return _digest(name, sympy.srepr(part).encode())
             case types.BuiltinMethodType() if not isinstance(part.__self__, types.ModuleType | None):
                 return self._all(f"method {part.__name__}", [part.__self__])  # of a list, say
-        if dataclasses.is_dataclass(part):
-            kind: Any = type(part)
-            of = b"" if kind.__module__.startswith(PACKAGE) else self._class(kind)
-            return _digest(name, of, *(self.digest(getattr(part, field.name)) for field in dataclasses.fields(kind)))
-        if type(part).__module__.startswith(PACKAGE):
-            return self._all(name, _attributes(part))
+        if owner(type(part).__module__) is Owner.KNOWN:
+            if dataclasses.is_dataclass(part):
+                fields = dataclasses.fields(part)
+                return _digest(name, *(self.digest(getattr(part, field.name)) for field in fields))
+            if type(part).__module__.startswith(f"{PACKAGE}."):
+                return self._all(name, _attributes(part))
+        if dataclasses.is_dataclass(part) and not callable(part):
+            return self._all(name, [type(part), *_attributes(part)])
         if callable(part):
             return _digest("function", self._number(part), getattr(part, "__qualname__", name).encode())
         raise TypeError(f"it is not known what makes two objects of type {type(part)} equal")
@@ -119,7 +139,7 @@ class _Walk:
 
     def _number(self, function: Callable) -> bytes:
         """The place of a function, or of a class, among those met so far."""
-        place = next((k for k, other in enumerate(self.functions) if other == function), len(self.functions))
+        place = next((k for k, other in enumerate(self.functions) if _is_same(other, function)), len(self.functions))
         if place == len(self.functions):
             self.functions.append(function)
         return str(place).encode()

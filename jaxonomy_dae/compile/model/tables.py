@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
+from jaxtyping import Bool
 
 from ...base.aliases import Numeric
 from ...write.interval import Interval
@@ -101,6 +102,31 @@ class ParameterTable:
         """The values of all parameters, given those that were declared, (n_declared,)."""
         values = np.concatenate([declared, self.relation_starts])
         return np.concatenate([values, values[self.discrete]])
+
+    @property
+    def follow_events(self) -> tuple[Formulas, ...]:
+        """The expressions that read what events assign, directly or through others."""
+        moved, found = self._assigned, []
+        for group in self.dependents:
+            rows = moved[group.parameter].any(axis=1) & ~moved[group.target]
+            if rows.any():
+                moved[group.target[rows]] = True
+                found.append(group.take(rows))
+        return tuple(found)
+
+    @property
+    def changed_by_events(self) -> Bool[np.ndarray, " parameters"]:
+        """The parameters that change at events: those that are assigned, and those that follow them."""
+        changed = self._assigned
+        for group in self.follow_events:
+            changed[group.target] = True
+        return changed
+
+    @property
+    def _assigned(self) -> Bool[np.ndarray, " parameters"]:
+        assigned = np.zeros(len(self), bool)
+        assigned[self.discrete] = True
+        return assigned
 
     @property
     def n_declared(self) -> int:

@@ -92,15 +92,16 @@ def held_table(model: ModelNumbers) -> HeldTable:
         ),
         key=lambda entry: entry[:2],
     )
-    text, active, impulse, force, closed, level, owner = [], [], [], [], [], [], []
+    text, active, impulse, rate, force, closed, level, owner = [], [], [], [], [], [], [], []
     for number, (k, n, row, i) in enumerate(found):
         held = i.component.held_branches[n]
         text.append(f"{model.paths[k]}: {held.text}")
         active.append(model.variable(i, held.active)[row])
         impulse.append(place[int(model.parameter(i, held.impulse.path)[row])])
+        rate.append(place[int(model.parameter(i, held.rate.path)[row])])
         force.append(-1 if held.force is None else model.variable(i, held.force)[row])
         closed.append(-1 if held.closed is None else place[int(model.parameter(i, held.closed.path)[row])])
         level += [model.variable(i, name)[row] for name in held.levels]
         owner += [number] * len(held.levels)
-    columns = (active, impulse, force, closed, level, owner)
+    columns = (active, impulse, rate, force, closed, level, owner)
     return HeldTable(tuple(text), *(np.array(column, np.int64) for column in columns))

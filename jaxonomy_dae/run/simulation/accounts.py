@@ -44,7 +44,7 @@ def account_values(
     system: AcausalSystem, ts: Times, states: State, inputs: Args, discrete: Array | None = None
 ) -> Numeric:
     """The values of all terms at all times, shape (n, terms); `discrete` holds the discrete values, if there are."""
-    given = (system, ts, states, inputs, discrete)
+    given = (system.without_stiffness, ts, states, inputs, discrete)
     return _terms(*given) if is_staged(given) else _compiled(*given)
 
 

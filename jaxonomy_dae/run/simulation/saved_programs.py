@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from ...base.aliases import PyTree
 from ...base.errors import ModelError
 from ...base.private_names import private
-from ...host.kept import CALLBACK, machine_and_versions
+from ...host.kept import calls_python, machine_and_versions
 from ...host.recalled import register
 
 MARK = b"jaxonomy_dae program 1\n"
@@ -34,7 +34,7 @@ def save_compiled(compiled: Any, path: str | PathLike[str]) -> None:
     """
     text = compiled.as_text() or ""
     targets = sorted(set(re.findall(r'custom_call_target="([^"]+)"', text)))
-    if any(CALLBACK.decode() in target for target in targets):
+    if any(calls_python(target.encode()) for target in targets):
         raise ModelError(
             "save_compiled: this program calls Python, which no other process can do for it: leave out throw=True, "
             "progress=True and prints"
@@ -55,17 +55,25 @@ def save_compiled(compiled: Any, path: str | PathLike[str]) -> None:
 
 def load_compiled(path: str | PathLike[str]) -> Callable:
     """Loads a program that `save_compiled` wrote. Call it with arguments of the same shapes and types: nothing is
-    compiled or traced. Loading runs code from the file, so load only files of people you trust.
+    compiled or traced.
+
+    Loading executes what is in the file: it is read by `pickle`, which runs code that a file may contain, and it holds
+    machine code, which runs when the program is called. Nothing is checked before. Load only files that you wrote, or
+    that come from people you trust, over a way on which nobody else could change them.
 
     **Raises:**
 
-    - `ModelError` for a file of another kind, and for a program of another processor or other versions.
+    - `ModelError` for a file of another kind, one that is not whole, and a program of another processor or other
+        versions.
     """
     whole = Path(path).read_bytes()
     if not whole.startswith(MARK):
         raise ModelError(f"load_compiled: '{path}' is not a file of save_compiled")
-    text, trees, content = pickle.loads(whole[len(MARK) :])
-    told = json.loads(text)
+    try:
+        text, trees, content = pickle.loads(whole[len(MARK) :])
+        told = json.loads(text)
+    except Exception as error:  # of a file that broke off, or holds something else
+        raise ModelError(f"load_compiled: '{path}' is not whole ({error}): save the program again") from error
     for what, here in machine_and_versions().items():
         if told["made for"].get(what) != here:
             there = told["made for"].get(what)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from ...base.aliases import Numeric, Time, Times
 from ...base.errors import ModelError
 from ...base.tolerances import KNOWN_ROUNDINGS
+from ...compile.diagnosis.wording import some
 from ...host.staging import picked
 from ...solve.events.problem import AbstractHybridProblem
 from ...solve.events.start import Resumed
@@ -34,6 +35,8 @@ class SavedState(eqx.Module):
         `system.holding(state.discrete).vector_field(state.t, state.x)`.
     - `sides`, `ticked`, `sizes`: the memory of the events: the side of each condition, the clocks that have ticked at
         this time, and the largest sizes of the quantities in conditions.
+    - `of`: a digest of the names of the states and of the discrete variables, so that a state is not taken for one of
+        another model with as many.
     """
 
     t: Time
@@ -42,6 +45,7 @@ class SavedState(eqx.Module):
     sides: Float[Array, "*batch guards"]
     ticked: Float[Array, "*batch clocks"]
     sizes: Float[Array, "*batch guards"]
+    of: str = eqx.field(static=True, default="")
 
     @property
     def events(self) -> Resumed:
@@ -100,6 +104,12 @@ def check_saved_state(system: AcausalSystem, t0: Time, state: SavedState) -> Non
                 f"initial: a state of this system has {name} of shape ({length},); this one has {shape}. It is a state "
                 "of another model, or a batch: map over batches with equinox.filter_vmap"
             )
+    if state.of and state.of != system.plan.digest_of_states:
+        raise ModelError(
+            f"initial: this state is one of another model: here, it has {some([*system.states, *system.carried])}"
+            + (f" and {some(list(system.discretes))}" if len(system.discretes) else "")
+            + ". Give initial={'component.variable': value, …} for what is to be taken over"
+        )
     finite = [part for part in (state.t, state.x, state.discrete) if not isinstance(part, Tracer)]
     if not all(np.isfinite(np.asarray(part)).all() for part in finite):
         raise ModelError("initial: this state has entries that are not finite: the run that it is of did not get there")

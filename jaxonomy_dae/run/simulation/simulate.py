@@ -230,7 +230,7 @@ def _given(system: AcausalSystem, t0: Time, t1: Time, ts: Times, inputs: Args, i
             # `check_start` lets rounding pass, Diffrax does not.
             ts = on_device(np.clip(np.asarray(ts), t0, t1), dtype)
     # The solver is chosen by `simulate`, so that the programs of models that differ in how stiff they are are the same.
-    return Given(dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
+    return Given(system.without_stiffness, t0, t1, ts, inputs, initial)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -112,11 +112,12 @@ class Solution(eqx.Module):
         t, x, none = cut(self.ts, (..., k)), cut(self.states, row), cut(self.states, (..., k, slice(0)))
         if not isinstance(x, Tracer) and x.ndim == 1 and not np.isfinite(x).all():
             raise ModelError(f"solution.at({int(k)}): the run did not get to t={float(t):g} ({self.result})")
+        of = self.system.plan.digest_of_states
         if self.discrete is None or self.memory is None:
-            return SavedState(t, x, none, none, none, none)
+            return SavedState(t, x, none, none, none, none, of)
         memory = self.memory
         sides, ticked = cut(memory.sides, row), cut(memory.ticked, row)
-        return SavedState(t, x, cut(self.discrete, row), sides, ticked, memory.sizes)
+        return SavedState(t, x, cut(self.discrete, row), sides, ticked, memory.sizes, of)
 
     def __getitem__(self, name: Any) -> Any:
         """The values of a variable, or of several: `solution["pend.x"]` has shape `(n,)`, and
@@ -164,7 +165,7 @@ class Solution(eqx.Module):
         owners = None if few else plan.owners(quantity)
         place = quantity if owners is None else np.searchsorted(plan.owned(owners), quantity)
         padded = on_device(np.resize(place, n)), on_device(np.resize(factor, n), self.states.dtype)
-        return _chosen(self.system, ts, states, self.inputs, discrete, *padded, owners)
+        return _chosen(self.system.without_stiffness, ts, states, self.inputs, discrete, *padded, owners)
 
     def _where_reached(self, values: Numeric) -> Numeric:
         """The values, shape (n, k), with not-a-number where they are not finite, and in rows that the run did not
@@ -285,10 +286,11 @@ class Solution(eqx.Module):
         """The residuals of all hidden constraints at the saved times, shape `(n, constraints)`."""
         if self.states.ndim > 2:
             return _each(self, Solution.constraint_residual)
+        system = self.system.without_stiffness
         if is_traced(self):
-            return _constraint_residual(self.system, self.ts, self.states, self.inputs, self.discrete)
+            return _constraint_residual(system, self.ts, self.states, self.inputs, self.discrete)
         ts, states, discrete = filled_up((self.ts, self.states, self.discrete))
-        return picked(_constraint_residual(self.system, ts, states, self.inputs, discrete), slice(len(self.ts)))
+        return picked(_constraint_residual(system, ts, states, self.inputs, discrete), slice(len(self.ts)))
 
     def to_dict(self) -> dict[str, Numeric]:
         """All variables, and `"time"`, by name."""

@@ -8,7 +8,6 @@ the nearest point.
 Where values are known the search runs outside of programs (`search_outside`), and a program holds the last steps alone.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -192,7 +191,7 @@ def search_outside(
 ) -> Found | None:
     """The point found by a ladder that runs in NumPy: a program of the rows and their Jacobian is all that is compiled.
     None where values are not known, as inside jit, and where the search is another one."""
-    plan, system = system.plan, dataclasses.replace(system, stiffness=None)  # another solver is no other program
+    plan, system = system.plan, system.without_stiffness
     system, t0, inputs, initial = known = jax.tree.map(
         lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, Tracer) else leaf, (system, t0, inputs, initial)
     )
@@ -362,7 +361,7 @@ def find_initial(
     check_initial(system, initial)
     inputs = read_inputs(system.plan, dtype, inputs)
     initial = {name: on_device(v, dtype) for name, v in sorted((initial or {}).items())}
-    arguments = (system, on_device(t0, dtype), inputs, initial, solve_for)
+    arguments = (system.without_stiffness, on_device(t0, dtype), inputs, initial, solve_for)
     if not is_staged(arguments):
         begun = search_outside(*arguments) if solver is None else None
         found = _compiled(*arguments, solver, begun)

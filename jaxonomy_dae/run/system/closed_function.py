@@ -7,6 +7,7 @@ compiled program, whatever their numbers are.
 """
 
 import dataclasses
+import functools
 import weakref
 from collections.abc import Callable, Hashable
 from typing import Any
@@ -18,6 +19,8 @@ import numpy as np
 from jax.core import Tracer
 
 from ...base.private_names import private
+from ...host.content import Content, Hidden, content
+from ...host.libraries import Owner, owner
 
 # Parameters of JAX's calls of functions with rules of their own for derivatives that hold the rules.
 RULES = ("jvp_jaxpr_fun", "fwd_jaxpr_thunk", "bwd", "out_trees")
@@ -25,6 +28,17 @@ RULES = ("jvp_jaxpr_fun", "fwd_jaxpr_thunk", "bwd", "out_trees")
 
 class _Program:
     """What a jaxpr computes: one object for all jaxprs that compute the same."""
+
+    def __init__(self, key: Hashable):
+        self._key = key
+
+    @functools.cached_property
+    def _content(self) -> Content:
+        return content(self._key)
+
+    def __content__(self) -> tuple[str, tuple]:
+        """For `host/content.py`."""
+        return self._content.digest, tuple(map(Hidden, self._content.unseen))
 
 
 # By what they are made of. Parts of a key are programs of their own, so that keys stay flat: the rules for derivatives
@@ -34,9 +48,9 @@ _PROGRAMS: weakref.WeakValueDictionary[Hashable, _Program] = weakref.WeakValueDi
 
 def _program(key: Hashable) -> _Program:
     try:
-        return _PROGRAMS.setdefault(key, _Program())
+        return _PROGRAMS.setdefault(key, _Program(key))
     except ValueError:  # of a comparison of arrays somewhere in parameters of users: nothing equals it
-        return _Program()
+        return _Program(key)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +59,10 @@ class _TracedFunction:
 
     jaxpr: Any = dataclasses.field(compare=False)
     program: _Program
+
+    def __content__(self) -> tuple[str, tuple]:
+        """For `host/content.py`."""
+        return "", (self.program,)
 
 
 class ClosedFunction(eqx.Module):
@@ -112,7 +130,7 @@ def _program_of(jaxpr: Any, inside: tuple[Hashable, ...] = ()) -> _Program:
     head = tuple((atom(v), v.aval.str_short()) for v in (*jaxpr.constvars, *jaxpr.invars))
     body = tuple(
         (
-            equation.primitive,
+            _Primitive(equation.primitive),
             tuple(atom(a) for a in equation.invars),
             tuple((atom(v), v.aval.str_short()) for v in equation.outvars),
             tuple((name, _key(value, inside)) for name, value in sorted(equation.params.items()) if name not in RULES),
@@ -172,6 +190,19 @@ def _key(value: Any, inside: tuple[Hashable, ...] = ()) -> Hashable:
     return type(value), value
 
 
+@dataclasses.dataclass(frozen=True)
+class _Primitive:
+    """A primitive of JAX's, which has one object for each, or of the user's, compared as an object."""
+
+    primitive: Any
+
+    def __content__(self) -> tuple[str, tuple]:
+        """For `host/content.py`."""
+        kind = type(self.primitive)
+        is_own = owner(getattr(getattr(self.primitive, "impl", None), "__module__", kind.__module__)) is Owner.KNOWN
+        return str(self.primitive), () if is_own else (Hidden(f"the primitive {self.primitive}"),)
+
+
 class _Same:
     """Wraps an object so that it is compared by identity, and kept alive while it is compared."""
 
@@ -183,3 +214,7 @@ class _Same:
 
     def __hash__(self) -> int:
         return id(self.value)
+
+    def __content__(self) -> tuple[str, tuple]:
+        """For `host/content.py`."""
+        return "", (self.value,)

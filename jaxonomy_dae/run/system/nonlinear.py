@@ -21,7 +21,7 @@ from ...base.tolerances import solved, spacing
 from ...compile.lowering.program import PlannedSparse, PlannedStep
 from ...solve.linear.arrays import Scalar
 from ...solve.linear.whole import solve_whole
-from .roots import find_root, is_small, newton_step
+from .roots import Beside, find_root, newton_step
 from .values import EquationAt, Values, filled
 
 ROUGH = 1e-2  # residual of an equation relative to its terms, where one Newton correction is made
@@ -86,37 +86,41 @@ class AbstractBlock(abc.ABC, Generic[_P]):
         """The residuals of these equations."""
         return [at.filled(at.residual()) for at in self.equations(inside, still=False)]
 
-    def magnitudes(self, inside: Inside) -> list[Array]:
-        """The magnitudes of their terms, as residuals are given by `step`."""
-        found = [at.filled(at.magnitude()) for at in self.equations(inside, still=True)]
-        return [jnp.concatenate([jnp.reshape(f, (-1,)) for f in found])] if self.whole else found
-
     def corrected(self, z: list[Array]) -> list[Array]:
         """The unknowns after one Newton step, which is exact if the equations are affine."""
         return [a + d for a, d in zip(z, self.step(z)[1], strict=True)]
 
-    def holds(self, inside: Inside, tolerated: float) -> Array:
-        """True where the equations hold, for each of the blocks or for all."""
-        verdicts, noise = [], self.noise(inside)
+    def beside(self, inside: Inside) -> list[tuple[EquationAt, Beside]]:
+        """The equations that z must fulfil, not to be differentiated, and what their residuals count as zero beside."""
+        noise, found = self.noise(inside), []
         for at in self.equations(inside, still=True):
             partials, typical = at.partials(through_networks=self.whole), inside.values.typical_of(at.planned)
-            verdict = is_small(at.residual(), at.magnitude(), partials, typical, tolerated, at.of_slots(noise))
-            verdicts.append(jnp.all(verdict) if self.whole else verdict)
-        return functools.reduce(jnp.logical_and, verdicts)
+            found.append((at, Beside.of(at.magnitude(), partials, typical, at.of_slots(noise))))
+        return found
+
+    def holds(self, beside: list[tuple[EquationAt, Beside]], tolerated: float) -> Array:
+        """True where the equations hold, for each of the blocks or for all."""
+        verdicts = [own.is_small(at.residual(), tolerated) for at, own in beside]
+        return functools.reduce(jnp.logical_and, [jnp.all(v) for v in verdicts] if self.whole else verdicts)
+
+    def judged(self, z: list[Array], tolerated: float, batch: tuple[int, ...]) -> tuple[Array, list[Array]]:
+        """Whether the equations hold at z, and the sizes of their residuals, as these are given by `step`."""
+        beside = self.beside(self.at(z))
+        sizes = [at.filled(own.size) for at, own in beside]
+        sizes = [jnp.concatenate([jnp.reshape(s, (-1,)) for s in sizes])] if self.whole else sizes
+        return jnp.broadcast_to(self.holds(beside, tolerated), batch), sizes
 
     def unknowns(self, refine: Refinement) -> list[Array]:
         """The chunks of the step; not-a-number where equations do not hold."""
         z = self.guess
         if refine is Refinement.ONCE:
             inside = self.at(self.corrected(z))
-            holds = self.holds(inside, ROUGH)
+            holds = self.holds(self.beside(inside), ROUGH)
         else:
             tolerated, batch = solved(self.dtype), () if self.whole else jnp.shape(z[0])
-            magnitudes = self.still.magnitudes(self.still.at(z))
             z, holds = find_root(
-                lambda z: jnp.broadcast_to((still := self.still).holds(still.at(z), tolerated), batch),
-                lambda z: self.still.step(z), self.corrected, magnitudes, z, batch,
-            )  # fmt: skip
+                lambda z: self.still.judged(z, tolerated, batch), lambda z: self.still.step(z), self.corrected, z, batch
+            )
             inside = self.at(z)
         nan = jnp.full_like(inside.chunks[0], jnp.nan)
         return [jax.lax.select(holds, u, nan) for u in inside.chunks]

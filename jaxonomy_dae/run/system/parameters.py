@@ -37,6 +37,10 @@ class ParameterNames:
     arrays: ArrayNames = dataclasses.field(default_factory=ArrayNames, compare=False, hash=False)
     digest: str = ""
 
+    def __content__(self) -> tuple[str, tuple]:
+        """For `host/content.py`."""
+        return self.digest, ()
+
     def index(self, name: str) -> int:
         found = self.names.number.get(name)
         if found is None:

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,29 +18,41 @@ NEWTON_STEPS = 120  # to the root of a nonlinear block, at most, halvings includ
 SURE = 1e-6  # residuals so small, relative to their terms at the start, need not fall: rounding has a part in them
 
 
-def is_small(
-    residual: Array,
-    terms: Array,
-    partials: Sequence[Scalar],
-    typical: Sequence[Scalar],
-    tolerated: float,
-    noise: Sequence[Scalar] = (),
-) -> Array:
-    """True if a residual is small beside its terms, or beside the rounding of what it is computed from.
-
-    **Arguments:**
+class Beside(NamedTuple):
+    """What a residual counts as zero beside.
 
     - `terms`: the magnitude of its terms.
-    - `partials`, `typical`, `noise`: its partial derivatives by slots; the typical sizes of these; and what rounding
-        may have left in them beyond their own.
+    - `typical`: Σ |∂r/∂s|·size(s) over all that stands in the equation, with typical sizes.
+    - `noise`: Σ |∂r/∂s|·δs, with what rounding may have left in s beyond its own.
     """
-    eps = spacing(jnp.result_type(residual))
-    pairs = list(zip(partials, typical, strict=False))  # of a network, its output alone
-    floor = _weighed([(p, s) for p, s in pairs if not _is_nothing(s)])
-    left = _weighed([(p, n) for p, n in zip(partials, noise, strict=False) if not _is_nothing(n)])
-    allowed = tolerated * terms + ZERO_WITHIN * eps * floor + NOISE * left
-    # Where a slope is infinite, as that of a root at zero, the equation holds exactly or not at all.
-    return (jnp.abs(residual) <= allowed) & ((allowed < jnp.inf) | (residual == 0))
+
+    terms: Scalar
+    typical: Scalar
+    noise: Scalar
+
+    @classmethod
+    def of(
+        cls, terms: Scalar, partials: Sequence[Scalar], typical: Sequence[Scalar], noise: Sequence[Scalar]
+    ) -> "Beside":
+        """From partial derivatives, typical sizes and rounding errors by slots."""
+        pairs = zip(partials, typical, strict=False)  # of a network, its output alone
+        floor = _weighed([(p, s) for p, s in pairs if not _is_nothing(s)])
+        return cls(
+            terms, floor, _weighed([(p, n) for p, n in zip(partials, noise, strict=False) if not _is_nothing(n)])
+        )
+
+    @property
+    def size(self) -> Scalar:
+        """How large the residual is where its unknowns are off by their sizes. Terms alone do not tell: those of a flow
+        that a valve has just stopped are 1e-45."""
+        return self.terms + self.typical
+
+    def is_small(self, residual: Scalar, tolerated: float) -> Array:
+        """True if a residual is small beside its terms, or beside the rounding of what it is computed from."""
+        eps = spacing(jnp.result_type(residual))
+        allowed = tolerated * self.terms + ZERO_WITHIN * eps * self.typical + NOISE * self.noise
+        # Where a slope is infinite, as that of a root at zero, the equation holds exactly or not at all.
+        return (jnp.abs(residual) <= allowed) & ((allowed < jnp.inf) | (residual == 0))
 
 
 def _weighed(pairs: Sequence[tuple[Scalar, Scalar]]) -> Scalar:
@@ -53,31 +66,35 @@ def _is_nothing(value: Scalar) -> bool:
 
 
 def find_root(
-    holds: Callable[[list[Array]], Array],
+    judged: Callable[[list[Array]], tuple[Array, list[Array]]],
     stepped: Callable[[list[Array]], tuple[list[Array], list[Array]]],
     differentiable: Callable[[list[Array]], list[Array]],
-    sizes: list[Array],
     z: list[Array],
     batch: tuple[int, ...],
 ) -> tuple[list[Array], Array]:
-    """Newton's method from z until all `holds`, one verdict for each of a batch of problems; and the verdicts.
+    """Newton's method from z until the equations hold, one verdict for each of a batch of problems; and the verdicts.
 
-    `stepped` gives the residuals and the step. A step is halved until the largest residual falls, relative to the
-    `sizes` of their terms at the start: whole steps go back and forth between the branches of a law with a kink.
+    `judged` gives the verdicts and the sizes of the residuals, `stepped` the residuals and the step. A step is halved
+    until the largest residual falls, relative to the sizes at the start: whole steps go back and forth between the
+    branches of a law with a kink.
 
     The search is not differentiated; two steps of the `differentiable` correction follow, written out.
     """
-    z, sizes = jax.lax.stop_gradient((z, sizes))
+    z = jax.lax.stop_gradient(z)
 
-    def look(z, part, least):
+    def look(z, part, memory):
+        least, sizes = memory
         residuals, step = stepped(z)
+        holds, own = judged(z)
+        sizes = [jnp.where(least == jnp.inf, a, b) for a, b in zip(own, sizes, strict=True)]
         off = [jnp.abs(r) / jnp.where(s > 0, s, 1) for r, s in zip(residuals, sizes, strict=True)]
         largest = functools.reduce(jnp.maximum, off)
         largest = jnp.max(largest) if len(batch) < jnp.ndim(largest) else largest
         falls = (largest <= (1 - part / 4) * least) | (least <= SURE)
-        return Tried(falls, holds(z), step, largest)
+        return Tried(falls, holds, step, (largest, sizes))
 
-    found = newton(look, z, jnp.full(batch, jnp.inf, z[0].dtype), NEWTON_STEPS, batch=batch)
+    begin = jnp.full(batch, jnp.inf, z[0].dtype), [jnp.zeros_like(r) for r in jax.eval_shape(stepped, z)[0]]
+    found = newton(look, z, begin, NEWTON_STEPS, batch=batch)
     z = jax.lax.stop_gradient(found.x)
     for _ in range(2):
         z = differentiable(z)

@@ -80,6 +80,10 @@ class Stiffness:
     def __hash__(self) -> int:
         return 0  # all else that is static tells models apart
 
+    def __content__(self) -> tuple[str, tuple]:
+        """For `host/content.py`: the decade."""
+        return repr(self.decay), ()
+
     def __repr__(self) -> str:  # JAX prints it where two systems do not stack
         return f"Stiffness(decays by about {self.decay:.0e} per unit of time)"
 

@@ -121,6 +121,11 @@ class AcausalSystem(eqx.Module):
         folded = "".join(f"<details><summary>{title}</summary>{''.join(body)}</details>" for title, body in sections)
         return f"<p><code>{html.escape(repr(self))}</code></p>{folded}"
 
+    @property
+    def without_stiffness(self) -> "AcausalSystem":
+        """The same for programs that choose no solver, which models share though one is stiffer than the other."""
+        return dataclasses.replace(self, stiffness=None)
+
     # --- changing ----------------------------------------------------------------------------------------------
 
     def with_parameters(self, values: Mapping[str, Any]) -> "AcausalSystem":
@@ -547,6 +552,27 @@ class AcausalSystem(eqx.Module):
         if is_traced((found, self, t0)):
             raise ModelError("initialization_report needs numbers: call it outside jit, grad and vmap")
         return InitializationReport(self, found, t0, inputs, initial, names)
+
+    def export_fmu(
+        self,
+        path: Any,
+        *,
+        outputs: Sequence[str] | None = None,
+        parameters: Sequence[str] | str = "all",
+        kinds: Sequence[str] | None = None,
+        platforms: Sequence[str] | str | None = None,
+        stop_time: float = 1.0,
+        tolerance: float = 1e-6,
+        overwrite: bool = False,
+    ) -> Any:
+        """Writes this system as a Functional Mock-up Unit, which other tools run without Python: see
+        `jaxonomy_dae.fmi.export_fmu`, which has the same arguments."""
+        from ...fmi.export import export_fmu
+
+        return export_fmu(
+            self, path, outputs=outputs, parameters=parameters, kinds=kinds, platforms=platforms,
+            stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
+        )  # fmt: skip
 
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
         if isinstance(solve_for, str):

@@ -277,6 +277,12 @@ class SystemAt:
         active = self._filled(self.run(plan.active_program, x, Refinement.NONE), plan.active)
         return active, self._filled(self.run(plan.level_program, x, Refinement.ONCE), plan.level)
 
+    def level_magnitudes(self, x: Array, sizes: Array) -> Array:
+        """The magnitudes of the levels' terms, shape (levels,); infinite or not-a-number where it is not known."""
+        plan = self._held()
+        found = self._measured(plan.level_program, x, sizes).size(plan.level)
+        return jnp.broadcast_to(jnp.asarray(found, self.dtype), (len(plan.level.chunk),))
+
     def held_forces(self, x: Array) -> Array:
         """The forces of the constraints that only push, shape (held,), zero for all others."""
         plan = self._held()
@@ -328,7 +334,14 @@ class SystemAt:
             size = size + absent
         jacobian, value = jacobian / size[:, None], value / size
         gram = jacobian @ jacobian.T
-        multiplier = jnp.linalg.solve(gram if absent is None else gram + jnp.diag(absent), value)
+        gram = gram if absent is None else gram + jnp.diag(absent)
+        # LAPACK apart, for few: with a matrix that turns out to be constant, XLA does not find it (jaxlib 0.10.2).
+        small = len(value) <= UNROLLED
+        multiplier = (
+            jnp.stack(solve([[*row] for row in gram], [*value], positive=True))
+            if small
+            else jnp.linalg.solve(gram, value)
+        )
         return jnp.concatenate([x[:n] - nominal * (multiplier @ jacobian), x[n:]])
 
     def _least_norm_of_few(self, state: Chunk) -> Array:

@@ -46,6 +46,10 @@ class Mass:
     def __hash__(self):
         return hash(self._digest)
 
+    def __content__(self) -> tuple[str, tuple]:
+        """For `host/content.py`."""
+        return self._digest, ()
+
     def __repr__(self):
         return f"Mass{self.array.shape}"
 

@@ -69,6 +69,10 @@ class SparsePattern:
     def __hash__(self):
         return hash(self.digest)
 
+    def __content__(self) -> tuple[str, tuple]:
+        """For `host/content.py`."""
+        return self.digest, ()
+
     def __repr__(self):
         return f"SparsePattern({self.n_rows} × {self.n}, {len(self)} entries)"
 

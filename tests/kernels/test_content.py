@@ -1,11 +1,10 @@
-"""Programs that a later process finds without tracing them.
+"""The identity by which programs are found again, in this process and without tracing in later ones.
 
-Kind of defect: a second process traced every program again to find its executable, half of what the first one took. The
-fault to fear is the other one: a program that is found for a call that computes something else.
+The fault to fear is a program that is found for a call that computes something else. `test_edits.py` has a table of
+edits; here are the parts.
 """
 
 import dataclasses
-import sys
 from typing import Any
 
 import diffrax
@@ -19,16 +18,25 @@ from problems import run
 
 from benchmarks.attack.invariance.declarations import PAIRS, STRUCTURE, built
 from jaxonomy_dae import solvers
-from jaxonomy_dae.host import kept, lasting, tiers
+from jaxonomy_dae.host import cache, kept, libraries, program
 from jaxonomy_dae.host.cache import ProgramCache
 from jaxonomy_dae.host.compilations import compilations
-from jaxonomy_dae.host.lasting import types_of
+from jaxonomy_dae.host.content import content
+from jaxonomy_dae.host.program import types_of
 
-FORM, TRACES = [jnp.sin], []
+
+class Noted(list):
+    """A list that does not count as content, so that a function may read and write it behind the back of the walk."""
+
+    def __content__(self):
+        return "noted", ()
+
+
+FORM, TRACES = Noted([jnp.sin]), Noted()
 
 
 def wave(x, k):
-    """f(k·x) twice, and which of the results are positive; f may be another one in another process."""
+    """f(k·x) twice, and which of the results are positive; f may be another one, and nothing tells."""
     TRACES.append(FORM[0])
     y = FORM[0](k * FORM[0](k * x))
     return {"y": y, "twice": 2 * k * y, "positive": y > 0, "name": "wave"}
@@ -36,23 +44,36 @@ def wave(x, k):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder in which programs are kept, and no cache of JAX's own; this file counts as one of a library."""
+    """A folder in which programs are kept, and no cache of JAX's own."""
     by_jax = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     compilation_cache.reset_cache()
     jax.config.update("jax_compilation_cache_dir", None)
     kept.keep_programs(tmp_path / "programs")
-    monkeypatch.setattr(lasting, "LIBRARIES", (*lasting.LIBRARIES, __name__))
-    monkeypatch.setattr(tiers, "_chosen_by_the_user", lambda: False)
-    monkeypatch.setattr(sys.modules[__name__], "FORM", [jnp.sin])
+    monkeypatch.setattr(program, "_chosen_by_the_user", lambda: False)
+    monkeypatch.setattr(libraries, "_is_patched", lambda: False)  # types are checked while tests run
+    FORM[:] = [jnp.sin]
     TRACES.clear()
+    libraries.code.cache_clear()
     yield
     compilation_cache.reset_cache()
     jax.config.update("jax_compilation_cache_dir", by_jax)
     kept._CHOSEN.clear()
+    libraries.code.cache_clear()
+
+
+@pytest.fixture(autouse=True)
+def another_process():
+    """What this process has compiled is forgotten, so that another cache of programs stands for another process."""
+    program._EXECUTABLES.clear()
+
+
+def next_process():
+    program._EXECUTABLES.clear()
+    return ProgramCache()
 
 
 def loss(programs, part, x, k):
-    return jnp.sum(programs.call(wave, True, (x, k), {})[part] ** 2)
+    return jnp.sum(programs.call(wave, False, (x, k), {})[part] ** 2)
 
 
 X, K = np.linspace(-1.0, 1.0, 3), 1.1
@@ -60,24 +81,23 @@ X, K = np.linspace(-1.0, 1.0, 3), 1.1
 
 def test_a_call_is_not_traced_again(folder):
     """Another cache of programs stands for another process: the outcome is the same to the last bit."""
-    first = ProgramCache().call(wave, True, (jnp.asarray(X), jnp.array(K)), {})
+    first = ProgramCache().call(wave, False, (jnp.asarray(X), jnp.array(K)), {})
     traced, since = len(TRACES), len(compilations())
-    second = ProgramCache().call(wave, True, (jnp.asarray(X), jnp.array(K)), {})
+    second = next_process().call(wave, False, (jnp.asarray(X), jnp.array(K)), {})
     assert len(TRACES) == traced and [c.how for c in compilations()[since:]] == ["loaded"]
     assert second["name"] == "wave" and second["positive"].dtype == bool
     for name in ("y", "twice", "positive"):
         np.testing.assert_array_equal(first[name], second[name])
 
 
-def test_code_that_has_changed_since_it_was_read(monkeypatch):
+def test_code_that_has_changed_since_it_was_read(folder, monkeypatch):
     """A developer edits a file of the package while a notebook runs: programs of the code before are not kept as those
-    of the code after."""
-    lasting._code.cache_clear()
-    assert lasting.lasting(1) is not None
-    lasting._code.cache_clear()
-    monkeypatch.setattr(lasting, "_IMPORTED", 0.0)
-    assert lasting.lasting(1) is None
-    lasting._code.cache_clear()
+    of the code after. Kind of defect: a file with an old date counted as one that this process had read."""
+    assert cache._identity("a") is not None
+    libraries.code.cache_clear()
+    (name, size, written, changed), *rest = libraries._SNAPSHOT
+    monkeypatch.setattr(libraries, "_SNAPSHOT", [(name, size, written, changed - 1), *rest])
+    assert cache._identity("a") is None
 
 
 DERIVATIVES = {
@@ -93,7 +113,7 @@ def test_derivatives_are_not_traced_again(folder, name):
         return DERIVATIVES[name](lambda k: loss(programs, "y", jnp.asarray(X), k), jnp.array(K))
 
     first, traced = found(ProgramCache()), len(TRACES)
-    np.testing.assert_array_equal(found(ProgramCache()), first)
+    np.testing.assert_array_equal(found(next_process()), first)
     assert len(TRACES) == traced
 
 
@@ -119,37 +139,22 @@ def test_another_pullback_of_what_was_found(folder, later):
     Where tracing then writes the same function in another way, the arrays of the old program are not used."""
     gradient(ProgramCache(), "y")
     FORM[:] = [later]
-    programs, traced = ProgramCache(), len(TRACES)
+    programs, traced = next_process(), len(TRACES)
     for _ in range(2):
         assert gradient(programs, "twice") == pytest.approx(by_jax(later, "twice"), rel=1e-13)
     assert len(TRACES) == traced + (1 if later is jnp.sin else 2)
 
 
-def test_what_was_found_is_optimized_once_that_pays(folder):
-    x, k = jnp.asarray(X), jnp.array(K)
-    first = ProgramCache().call(wave, True, (x, k), {})
-    programs, since = ProgramCache(), len(compilations())
-    programs.call(wave, True, (x, k), {})
-    (called,) = programs._programs.values()
-    program: Any = called.function._program
-    program._spent = 1e6
-    programs.call(wave, True, (x, k), {})
-    for thread in list(tiers._THREADS):
-        thread.join()
-    assert [c.how for c in compilations()[since:]] == ["loaded", "optimized"]
-    np.testing.assert_allclose(programs.call(wave, True, (x, k), {})["y"], first["y"], rtol=1e-15)
-
-
 def test_an_executable_that_is_gone_is_compiled_anew(folder):
     x, k = jnp.asarray(X), jnp.array(K)
-    first = ProgramCache().call(wave, True, (x, k), {})
+    first = ProgramCache().call(wave, False, (x, k), {})
     where: Any = kept.folder()
     smallest = min(where.iterdir(), key=lambda path: path.stat().st_size)  # the record
     for path in set(where.iterdir()) - {smallest}:
         path.unlink()
-    np.testing.assert_array_equal(ProgramCache().call(wave, True, (x, k), {})["y"], first["y"])
+    np.testing.assert_array_equal(next_process().call(wave, False, (x, k), {})["y"], first["y"])
     smallest.write_bytes(b"not a record")
-    np.testing.assert_array_equal(ProgramCache().call(wave, True, (x, k), {})["y"], first["y"])
+    np.testing.assert_array_equal(next_process().call(wave, False, (x, k), {})["y"], first["y"])
 
 
 # --- what must not be taken for the same ---------------------------------------------------------------------------
@@ -159,9 +164,12 @@ class Slow(eqx.Module):
     rate: float = eqx.field(static=True)
 
 
-def local(rate):
+def local(rate, power=1):
     class Slow(eqx.Module):
         rate: float = eqx.field(static=True)
+
+        def __call__(self, x):
+            return self.rate * x**power
 
     return Slow(rate)
 
@@ -186,42 +194,40 @@ DIFFERENT = {
     "static parts": (jax.tree.structure(eqx.nn.Linear(2, 3, key=jax.random.key(0))),
                      jax.tree.structure(eqx.nn.Linear(2, 4, key=jax.random.key(0)))),
     "record and function": (Slow(1.0), jnp.sin),
+    "classes of one name": (local(1.0), local(1.0, 2)),
+    "static fields": (Slow(1.0), Slow(True)),
+    "masks": (np.ma.array([1.0, 2.0], mask=[0, 1]), np.ma.array([1.0, 2.0], mask=[1, 0])),
+    "arrays of objects": (np.array([1, None]), np.array([1.0, None])),
+    "signs of zero in an array": (np.zeros(1), -np.zeros(1)),
+    "keys": (jax.random.key(0), jax.random.key(1)),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DIFFERENT)
-def test_what_differs_is_told_apart(name, monkeypatch):
-    monkeypatch.setattr(lasting, "LIBRARIES", (*lasting.LIBRARIES, __name__))
+def test_what_differs_is_told_apart(name):
     one, other = DIFFERENT[name]
-    digests = lasting.lasting(one), lasting.lasting(other)
-    assert None not in digests and digests[0] != digests[1]
-    assert digests == (lasting.lasting(one), lasting.lasting(other))
-
-
-@pytest.mark.parametrize(
-    "part", [lambda x: x, wave, Slow(1.0), local(1.0), [Slow], object(), {1: wave}, np.array([object()])]
-)
-def test_code_of_users_is_not_told(part):
-    """A function, or a class, may be another one in the next process, and so may all that it reads."""
-    assert lasting.lasting(part) is None
+    assert content(one).digest != content(other).digest and not content(one).unseen
+    assert content(one) == content(one) and content(other) == content(other)
 
 
 @pytest.mark.parametrize("name", [name for name, (_, kind) in PAIRS.items() if kind == STRUCTURE])
 def test_models_of_other_structure_are_told_apart(name):
     """Pairs of models that differ in one argument of a declaration."""
-    digests = [lasting.lasting(jax.tree.structure(built(one))) for one in PAIRS[name][0]]
-    assert digests[0] != digests[1] or digests == [None, None]
+    one, other = (content(*jax.tree.flatten(eqx.partition(built(each), eqx.is_array)[1])) for each in PAIRS[name][0])
+    assert one.digest != other.digest
 
 
 def test_options_of_jax_and_types_are_told_apart():
-    options = {lasting.lasting(1)}
+    options = {cache._of_options()}
     with jax.enable_x64(False):
-        options.add(lasting.lasting(1))
+        options.add(cache._of_options())
     with jax.default_matmul_precision("highest"):
-        options.add(lasting.lasting(1))
+        options.add(cache._of_options())
     with jax.numpy_dtype_promotion("standard"):
-        options.add(lasting.lasting(1))
-    assert len(options) == 4
+        options.add(cache._of_options())
+    with jax.threefry_partitionable(not jax.config.jax_threefry_partitionable):  # pyright: ignore
+        options.add(cache._of_options())
+    assert len(options) == 5 and cache._of_options() in options
     arrays = jnp.ones(2), jnp.ones(3), jnp.ones(2, jnp.float32), jnp.ones((2, 1))
     assert len({types_of([a]) for a in arrays}) == 4
     assert types_of([jnp.asarray(np.ones(()))]) != types_of([jax.jit(lambda: 1.0)()])  # weakly typed
@@ -254,8 +260,8 @@ for system in (decay(), decay(law)):
 """
 
 
-@pytest.mark.long("two processes that compile a gradient")
-def test_the_next_process_traces_nothing_but_code_of_users(tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_the_next_process_traces_nothing_but_code_that_is_new(tmp_path, monkeypatch):
     """The second process finds the model's programs. A user's function of the same name is another one there."""
     monkeypatch.setenv("JAXONOMY_DAE_CACHE", str(tmp_path))
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)

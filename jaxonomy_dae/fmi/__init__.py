@@ -1,0 +1,4 @@
+"""Models for other tools and from them: Functional Mock-up Units, and functions of JAX written in C."""
+
+from .export import export_fmu as export_fmu
+from .imported import FmuComponent as FmuComponent

@@ -1,0 +1,165 @@
+"""`modelDescription.xml` of FMI 3.0: variables with their units, starts and bounds, and what depends on what."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Sequence
+from fractions import Fraction
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from ..base.errors import MissingPackage
+from ..compile.model.array_names import inner_name
+from ..graph.units.parse import UnknownUnit, read_unit
+from ..graph.units.unit import Unit, rate
+from .model_c import CVariable
+
+STRUCTURED = re.compile(r"[A-Za-z_]\w*(\[\d+(,\d+)*\])?(\.[A-Za-z_]\w*(\[\d+(,\d+)*\])?)*", re.ASCII)
+SI_IN_XML = ("kg", "m", "s", "A", "K", "mol", "cd")  # the order of the standard's schema
+
+
+@dataclasses.dataclass(frozen=True)
+class Variable:
+    """A variable of an FMU: the attributes of the standard, and what it is in the C code. `derivative` is the place of
+    the state whose derivative it is."""
+
+    name: str
+    causality: str
+    variability: str
+    c: CVariable
+    initial: str | None = None
+    start: np.ndarray | None = None
+    unit: str = ""
+    description: str = ""
+    nominal: float = 0.0
+    derivative: int | None = None
+    reinit: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Structure:
+    """What depends on what: for each of these variables by their places, the places of those that it depends on, or
+    None for all."""
+
+    outputs: dict[int, Sequence[int] | None]
+    derivatives: dict[int, Sequence[int] | None]
+    indicators: dict[int, Sequence[int] | None]
+    initial: Sequence[int]
+
+
+def structured(name: str) -> str:
+    """A name as the naming convention `structured` writes it: der(m.x,2) for a second derivative, and with a quoted
+    part where it has letters that identifiers have not."""
+    order, inner = inner_name(name)
+    if not STRUCTURED.fullmatch(inner):
+        legal = re.sub(r"[^A-Za-z0-9_!#$%&()*+,\-./:;<>=?@\[\]^{}|~ ]", "_", inner)
+        inner = f"'{legal}'"
+    return inner if not order else f"der({inner})" if order == 1 else f"der({inner},{order})"
+
+
+def unit_of_rate(unit: str) -> str:
+    """The unit of a time derivative; none where it would need to be written anew."""
+    found = _read(unit)
+    if found is None:
+        return ""
+    return "s-1" if unit == "1" else str(rate(found, 1).text)
+
+
+def _read(unit: str) -> Unit | None:
+    try:
+        return read_unit(unit)
+    except (UnknownUnit, MissingPackage):
+        return None
+
+
+def model_description(
+    model: str, identifier: str, token: str, variables: Sequence[Variable], structure: Structure, completed: bool,
+    co_simulation: bool, stop: float, tolerance: float,
+) -> str:  # fmt: skip
+    """The XML text; the place of a variable is its value reference. `completed` says whether integrators must tell
+    of completed steps."""
+    abilities = (
+        f'modelIdentifier="{identifier}" canGetAndSetFMUState="true" canSerializeFMUState="true" '
+        'providesDirectionalDerivatives="true" providesAdjointDerivatives="true"'
+    )
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<fmiModelDescription fmiVersion="3.0" modelName={quoteattr(model)} instantiationToken="{token}" '
+        'generationTool="jaxonomy_dae" variableNamingConvention="structured">',
+        f"  <ModelExchange {abilities}" + ' needsCompletedIntegratorStep="true"' * completed + "/>",
+        *([f'  <CoSimulation {abilities} canHandleVariableCommunicationStepSize="true"/>'] if co_simulation else []),
+        *_units(variables),
+        '  <LogCategories><Category name="logStatusError"/><Category name="logStatusDiscard"/></LogCategories>',
+        f'  <DefaultExperiment startTime="0" stopTime="{_number(stop)}" tolerance="{_number(tolerance)}"/>',
+        "  <ModelVariables>",
+        *(line for k, variable in enumerate(variables) for line in _variable(k, variable)),
+        "  </ModelVariables>",
+        "  <ModelStructure>",
+    ]
+    for tag, group in (
+        ("Output", structure.outputs), ("ContinuousStateDerivative", structure.derivatives),
+        ("InitialUnknown", dict.fromkeys(structure.initial)), ("EventIndicator", structure.indicators),
+    ):  # fmt: skip
+        for place, dependencies in group.items():
+            listed = "" if dependencies is None else f' dependencies="{" ".join(map(str, dependencies))}"'
+            lines.append(f'    <{tag} valueReference="{place}"{listed}/>')
+    return "\n".join([*lines, "  </ModelStructure>", "</fmiModelDescription>", ""])
+
+
+def _number(x: float) -> str:
+    return str(float(x))
+
+
+def _units(variables: Sequence[Variable]) -> list[str]:
+    texts = dict.fromkeys(v.unit for v in variables if v.unit)
+    if not texts:
+        return []
+    lines = ["  <UnitDefinitions>"]
+    for text in texts:
+        unit = _read(text)
+        base = "" if unit is None else _base_unit(unit, text)
+        lines.append(
+            f"    <Unit name={quoteattr(text)}>{base}</Unit>" if base else f"    <Unit name={quoteattr(text)}/>"
+        )
+    return [*lines, "  </UnitDefinitions>"]
+
+
+def _base_unit(unit: Unit, text: str) -> str:
+    """The exponents of base units, with what takes values to them; empty for exponents that are no integers."""
+    exponents = dict(unit.dimension)
+    if any(e != int(e) for e in exponents.values()):
+        return ""
+    if text in ("rad", "rad/s"):  # angles are numbers to `units`, and a unit of their own to the standard
+        exponents = exponents | {"rad": Fraction(1)}
+    parts = [f'{name}="{int(exponents[name])}"' for name in (*SI_IN_XML, "rad") if exponents.get(name)]
+    parts += [f'factor="{_number(unit.scale)}"'] if unit.scale != 1.0 else []
+    parts += [f'offset="{_number(unit.zero)}"'] if unit.zero else []
+    return f"<BaseUnit {' '.join(parts)}/>" if parts else "<BaseUnit/>"
+
+
+def _variable(place: int, v: Variable) -> list[str]:
+    attributes = [
+        f"name={quoteattr(v.name)}", f'valueReference="{place}"', f'causality="{v.causality}"',
+        f'variability="{v.variability}"',
+    ]  # fmt: skip
+    if v.description:
+        attributes.append(f"description={quoteattr(v.description)}")
+    if v.unit:
+        attributes.append(f"unit={quoteattr(v.unit)}")
+    if v.initial:
+        attributes.append(f'initial="{v.initial}"')
+    if v.nominal > 0 and v.nominal != 1.0:
+        attributes.append(f'nominal="{_number(v.nominal)}"')
+    attributes += [f'{end}="{_number(x)}"' for end, x in (("min", v.c.low), ("max", v.c.high)) if math.isfinite(x)]
+    if v.derivative is not None:
+        attributes.append(f'derivative="{v.derivative}"')
+    if v.reinit:
+        attributes.append('reinit="true"')
+    shape = () if v.start is None else np.shape(v.start)
+    if v.start is not None:
+        attributes.append(f'start="{" ".join(map(_number, np.ravel(v.start)))}"')
+    head = f"    <Float64 {' '.join(attributes)}"
+    if not shape:
+        return [f"{head}/>"]
+    return [f"{head}>" + "".join(f'<Dimension start="{n}"/>' for n in shape) + "</Float64>"]

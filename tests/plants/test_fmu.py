@@ -1,0 +1,430 @@
+"""FMUs beside the systems that they were made of: runs by FMPy's CVode, derivatives, events, states that are saved."""
+
+import contextlib
+import math
+import subprocess
+import threading
+import zipfile
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cell_arrays import ladder
+from fmus import opened, problems, run
+from hybrid_models import Ball, Bob, Doubling, SampledPI, Stick, Thermostat
+from hybrid_models import compiled as hybrid
+from problems import compiled, drag_on, mlp, pendulum
+
+from jaxonomy_dae import Component, EqnEnv, der, simulate
+from jaxonomy_dae.errors import ModelError
+from jaxonomy_dae.fmi import export_fmu
+from jaxonomy_dae.fmi.compilers import FLAGS, compiler_for, this_platform
+from jaxonomy_dae.run.system.nonlinear import Refinement
+from jaxonomy_dae.write import Eq
+
+pytestmark = pytest.mark.skipif(compiler_for(this_platform()) is None, reason="no C compiler on this machine")
+
+
+def exported(system, folder, name="model", **options):
+    path = system.export_fmu(folder / f"{name}.fmu", **options)
+    assert problems(path) == []
+    return path
+
+
+class Robertson(Component):
+    """Three reacting species, their sum conserved; Robertson 1966."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        k1, k2, k3 = (self.parameter(n, v) for n, v in (("k1", 0.04), ("k2", 3e7), ("k3", 1e4)))
+        a, b = self.variable("a", start=1.0, fixed=True), self.variable("b", start=0.0, fixed=True, nominal=1e-5)
+        c = self.variable("c", start=0.0)
+        self.add_equations(
+            Eq(der(a), -k1 * a + k3 * b * c), Eq(der(b), k1 * a - k3 * b * c - k2 * b**2), Eq(a + b + c, 1)
+        )
+
+
+class House(Component):
+    """Two masses that exchange heat nonlinearly, with the outside from outside; q follows from an implicit equation."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        outside, heat = self.input("outside", default=5.0), self.input("heat", default=1.0)
+        C, G = self.parameter("C", 2.0, bounds=(0.1, 100.0)), self.parameter("G", 0.3)
+        air, wall = self.variable("air", start=20.0, fixed=True), self.variable("wall", start=15.0, fixed=True)
+        q = self.variable("q", start=1.0)
+        self.add_equations(
+            Eq(C * der(air), heat - q), Eq(10 * der(wall), q - G * (wall - outside)), Eq(q + 0.1 * q**3, air - wall)
+        )
+
+
+class Learned(Component):
+    """A state that falls by a function of it."""
+
+    def __init__(self, ev, name, function):
+        super().__init__(ev, name)
+        x = self.variable("x", start=1.0, fixed=True)
+        (y,) = self.function("law", function, inputs=[x])
+        self.add_equations(Eq(der(x), -y))
+
+
+def house():
+    return compiled(House(EqnEnv(), "house"))
+
+
+def swing(mode="auto"):
+    return pendulum(drag_on("vx", "vy", network=mlp(2, 2)), compiler={"state_selection": mode})
+
+
+# --- a ball: all of it, once ---------------------------------------------------------------------------------------
+
+
+def bounces(h0, e, g, t):
+    """Height, speed and count of a ball that bounces, in closed form."""
+    fall = math.sqrt(2 * h0 / g)
+    if t < fall:
+        return h0 - g * t**2 / 2, -g * t, 0
+    n, begin, speed = 1, fall, e * g * fall
+    while t >= begin + 2 * speed / g:
+        begin, speed, n = begin + 2 * speed / g, e * speed, n + 1
+    s = t - begin
+    return speed * s - g * s**2 / 2, speed - g * s, n
+
+
+@pytest.fixture(scope="module")
+def heated(tmp_path_factory):
+    """The house, with one output."""
+    return exported(house(), tmp_path_factory.mktemp("house"), "house", outputs=["house.q"])
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    return exported(hybrid(Ball, "b"), tmp_path_factory.mktemp("ball"), "ball", stop_time=2.0)
+
+
+def test_a_ball_bounces_as_in_closed_form(ball):
+    found = run(ball, 2.0, ["b.h", "b.v", "b.n"], record_events=False)
+    expected = np.array([bounces(1.0, 0.8, 9.81, t) for t in found["time"]])
+    for k, name in enumerate(["b.h", "b.v", "b.n"]):
+        np.testing.assert_allclose(found[name], expected[:, k], atol=1e-7)
+    found = run(ball, 2.0, ["b.h", "b.n"], fmi_type="CoSimulation")
+    np.testing.assert_allclose(found["b.h"], expected[:, 0], atol=1e-12)
+    np.testing.assert_array_equal(found["b.n"], expected[:, 2])
+    found = run(ball, 1.0, ["b.h"], start_values={"b.h0": 2.0, "b.e": 0.5})
+    np.testing.assert_allclose(found["b.h"][-1], bounces(2.0, 0.5, 9.81, 1.0)[0], atol=1e-7)
+
+
+def test_what_an_fmu_holds(ball, tmp_path):
+    with zipfile.ZipFile(ball) as file:
+        names = set(file.namelist())
+        assert {"modelDescription.xml", "sources/model.c", "sources/buildDescription.xml"} <= names
+        file.extractall(tmp_path)
+    assert f"binaries/{this_platform()}/ball.so" in names or this_platform().endswith(("windows", "darwin"))
+    assert ball.stat().st_size < 100_000
+    sources = tmp_path / "sources"
+    command = [*(compiler_for(this_platform()) or ()), *FLAGS, "-Wall", "-Wextra", "-Werror", "-O0"]
+    done = subprocess.run(
+        [*command, "fmi3_model_exchange.c", "-o", "x.so", "-lm"], cwd=sources, capture_output=True, text=True
+    )
+    assert not done.returncode, done.stderr
+    symbols = subprocess.run(["nm", "-D", "--defined-only", "x.so"], cwd=sources, capture_output=True, text=True)
+    assert symbols.stdout and all(line.split()[-1].startswith("fmi3") for line in symbols.stdout.splitlines())
+    needed = subprocess.run(["nm", "-D", "--undefined-only", "x.so"], cwd=sources, capture_output=True, text=True)
+    names = {line.split()[-1].split("@")[0] for line in needed.stdout.splitlines()}
+    # What the start-up files of Linux bring, memory of instances, `string.h` and `math.h`.
+    own = "calloc malloc free memcpy memset memcmp strcmp strlen strncat sqrt fmod pow exp"
+    assert {n for n in names if not n.startswith("_")} <= set(own.split())
+
+
+def test_states_are_saved_in_the_middle_of_a_bounce(ball):
+    def on(fmu):
+        """One step of a run by hand: through the fall of a guard, and on."""
+        model = fmu.model
+        model.enterContinuousTimeMode()
+        model.setTime(0.5)
+        model.setContinuousStates(np.array([-1e-9, -4.4]).ctypes.data_as(model_pointer()), 2)
+        entered = model.completedIntegratorStep()[0]
+        model.enterEventMode()
+        fmu.update()
+        return entered, fmu.get("b.h", "b.v", "b.n", "events.guard[1]", "events.indicator[1]")
+
+    with opened(ball) as fmu, opened(ball) as other:
+        state = fmu.model.getFMUState()
+        entered, first = on(fmu)
+        assert entered and first[1] == pytest.approx(0.8 * 4.4, rel=1e-6) and first[2] == 1.0
+        fmu.model.setFMUState(state)
+        assert fmu.get("b.n")[0] == 0.0
+        np.testing.assert_array_equal(on(fmu)[1], first)  # bit for bit
+        fmu.model.setFMUState(state)
+        saved = fmu.model.serializeFMUState(fmu.model.getFMUState())
+        np.testing.assert_array_equal(on(other)[1], first)
+        other.model.setFMUState(other.model.deserializeFMUState(saved))
+        assert other.get("b.n")[0] == 0.0
+        np.testing.assert_array_equal(on(other)[1], first)
+
+
+def model_pointer():
+    import ctypes
+
+    return ctypes.POINTER(ctypes.c_double)
+
+
+def test_bad_values_are_refused_by_name(ball, heated):
+    import fmpy
+
+    def status(call):
+        with pytest.raises(fmpy.fmi1.FMICallException if hasattr(fmpy, "fmi1") else Exception):
+            call()
+
+    with opened(ball) as fmu:
+        for values in ({"b.g": math.nan}, {"b.h0": 1.0}, {"b.n": 1.0}, {"der(b.h)": 0.0}):
+            status(lambda values=values: fmu.set(values))
+        status(lambda: fmu.forward(["events.indicator[1]"], ["b.h"], [1.0]))
+        status(lambda: fmu.forward(["der(b.h)"], ["b.n"], [1.0]))
+        status(lambda: fmu.model.getFloat64([9999]))
+    with opened(heated) as fmu:
+        status(lambda: fmu.set({"house.C": 1000.0}))
+
+
+def test_what_cannot_be_exported_is_refused_by_name(tmp_path, ball):
+    system = hybrid(Ball, "b")
+    with pytest.raises(ModelError, match="ends in .fmu"):
+        export_fmu(system, tmp_path / "ball.zip")
+    with pytest.raises(ModelError, match="exists: give another name, or overwrite=True"):
+        export_fmu(system, ball)
+    with pytest.raises(ModelError, match="'b.w' is not a variable"):
+        export_fmu(system, tmp_path / "x.fmu", outputs=["b.w"])
+    with pytest.raises(ModelError, match="'b.w' is neither a parameter nor a network"):
+        export_fmu(system, tmp_path / "x.fmu", parameters=["b.w"])
+    with pytest.raises(ModelError, match="'b.n' is a discrete variable"):
+        export_fmu(system, tmp_path / "x.fmu", parameters=["b.n"])
+    with pytest.raises(ModelError, match="platforms: 'amiga' is not known"):
+        export_fmu(system, tmp_path / "x.fmu", platforms="amiga")
+    with pytest.raises(ModelError, match="kinds: 'simulink' is not known"):
+        export_fmu(system, tmp_path / "x.fmu", kinds=["simulink"])
+
+    def gamma(u):
+        return jax.scipy.special.gammainc(2.0, u)
+
+    with pytest.raises(ModelError, match=r"no C code for the JAX primitive 'igamma' .*test_fmu.py:\d+, in .*gamma"):
+        export_fmu(compiled(Learned(EqnEnv(), "c", gamma)), tmp_path / "x.fmu")
+
+
+# --- derivatives ----------------------------------------------------------------------------------------------------
+
+
+def point(system, fmu, outputs):
+    """Returns (names of unknowns, of knowns, values of knowns, the unknowns as a function of the knowns' values)."""
+    states = system.states
+    unknowns = [*(f"der({n})" for n in states), *outputs]
+    leaves, tree = jax.tree.flatten(eqx.filter(system.neural, eqx.is_inexact_array))
+    weights = [n for n in fmu.reference if n.startswith("drag.")]
+    parameters = [
+        v.name for v in fmu.description.modelVariables if v.causality == "parameter" and v.name not in weights
+    ]
+    inputs = system.inputs
+    knowns = ["time", *states, *inputs, *parameters, *weights]
+    values = [np.asarray(fmu.get(n) if n not in weights else None) for n in knowns if n not in weights]
+    values = [jnp.asarray(v[0]) for v in values] + leaves
+    n, m, k = len(states), len(inputs), len(parameters)
+
+    discrete = jnp.asarray([*(fmu.get(name)[0] for name in system.discretes)])
+    q = jnp.concatenate([discrete, system.discrete_values[len(discrete) :]])
+    guess = system.initialize()[n:]
+
+    def function(*given):
+        t, x, u = given[0], jnp.stack(given[1 : 1 + n]), given[1 + n : 1 + n + m]
+        p, w = given[1 + n + m : 1 + n + m + k], given[1 + n + m + k :]
+        own = system.with_parameters(dict(zip(parameters, p, strict=True)))
+        own = eqx.tree_at(lambda s: s.neural, own, eqx.combine(jax.tree.unflatten(tree, w), system.neural))
+        own, args = own.holding(q), dict(zip(inputs, u, strict=True))
+        if len(guess):
+            x = own.at(t, args).refined(jnp.concatenate([x, guess]), Refinement.ROOT)
+        return jnp.concatenate([own.vector_field(t, x, args)[:n], own.observe(outputs, t, x, args)])
+
+    return unknowns, knowns, values, function
+
+
+def check_derivatives(system, path, outputs, seed=0, rtol=1e-10):
+    """Both derivatives are those of JAX, and each other's transposes."""
+    rng = np.random.default_rng(seed)
+    with opened(path) as fmu:
+        unknowns, knowns, values, function = point(system, fmu, outputs)
+        along = [rng.normal(size=np.shape(v)) for v in values]
+        weight = rng.normal(size=len(unknowns))
+        value, slope = jax.jit(lambda v, a: jax.jvp(function, tuple(v), tuple(a)))(values, along)
+        back = jax.jit(lambda v, w: jax.vjp(function, *v)[1](w))(values, jnp.asarray(weight))
+        flat = np.concatenate([np.ravel(a) for a in along])
+        np.testing.assert_allclose(fmu.get(*unknowns), value, rtol=1e-11, atol=1e-11)
+        forward = fmu.forward(unknowns, knowns, flat)
+        scale = max(np.abs(slope).max(), 1e-300)
+        np.testing.assert_allclose(forward / scale, slope / scale, atol=rtol)
+        reverse = fmu.reverse(unknowns, knowns, weight, len(flat))
+        expected = np.concatenate([np.ravel(b) for b in back])
+        scale = max(np.abs(expected).max(), 1e-300)
+        np.testing.assert_allclose(reverse / scale, expected / scale, atol=rtol)
+        both = weight @ forward, reverse @ flat
+        assert abs(both[0] - both[1]) <= 1e-12 * max(np.abs(reverse * flat).sum(), np.abs(weight * forward).sum())
+
+
+def test_derivatives_through_an_implicit_equation(heated):
+    """q + 0.1·q³ = air − wall: dq/dair = 1/(1 + 0.3·q²)."""
+    with opened(heated) as fmu:
+        q, slope = fmu.get("house.q", "der(house.air)")
+        assert q + 0.1 * q**3 == pytest.approx(5.0, rel=1e-12) and slope == pytest.approx((1.0 - q) / 2.0)
+        dq = 1 / (1 + 0.3 * q**2)
+        unknowns, knowns = ["house.q", "der(house.air)", "der(house.wall)"], ["house.air", "house.heat", "house.C"]
+        jacobian = np.array([[dq, 0, 0], [-dq / 2, 0.5, -(1 - q) / 4], [dq / 10, 0, 0]])
+        for k in range(3):
+            np.testing.assert_allclose(fmu.forward(unknowns, knowns, np.eye(3)[k]), jacobian[:, k], atol=1e-13)
+            np.testing.assert_allclose(fmu.reverse(unknowns, knowns, np.eye(3)[k], 3), jacobian[k], atol=1e-13)
+        fmu.set({"house.heat": 3.0})  # an input, and a tunable parameter in event mode
+        fmu.set({"house.C": 4.0})
+        assert fmu.get("der(house.air)")[0] == pytest.approx((3.0 - q) / 4.0)
+
+
+def test_dependencies_are_those_of_the_equations(heated):
+    with opened(heated) as fmu:
+        found = {
+            unknown.variable.name: {v.name for v in unknown.dependencies}
+            for unknown in (*fmu.description.outputs, *fmu.description.derivatives)
+        }
+    assert found == {
+        "house.q": {"house.air", "house.wall"},
+        "der(house.air)": {"house.air", "house.wall", "house.heat", "house.C"},
+        "der(house.wall)": {"house.air", "house.wall", "house.outside", "house.G"},
+    }
+
+
+@pytest.mark.slow
+def test_the_same_model_gives_the_same_bytes(tmp_path):
+    paths = [export_fmu(house(), tmp_path / f"{k}/house.fmu") for k in range(2) if not (tmp_path / f"{k}").mkdir()]
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    other = export_fmu(house().with_parameters({"house.C": 3.0}), tmp_path / "house.fmu")
+    assert other.read_bytes() != paths[0].read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
+def test_a_pendulum_with_a_network(tmp_path, mode):
+    system = swing(mode)
+    path = exported(system, tmp_path, stop_time=2.0)
+    check_derivatives(system, path, ["pend.lam"])
+    t1 = 2.0 if mode == "auto" else 0.5
+    compare(system, path, t1, ["pend.x", "pend.vy", "pend.lam"], 1e-6)
+    compare(system, path, t1, ["pend.x", "pend.vy", "pend.lam"], 1e-6, fmi_type="CoSimulation")
+
+
+@pytest.mark.slow
+def test_other_starts_are_found_in_c(tmp_path):
+    """The release angle of a pendulum, which moves x and y on the circle."""
+    path = exported(swing(), tmp_path, outputs=["pend.lam"])
+    with opened(path, {"pend.initial_theta": 0.3, "pend.L": 2.0}) as fmu:
+        np.testing.assert_allclose(fmu.get("pend.x", "pend.y"), [2 * math.cos(0.3), 2 * math.sin(0.3)], atol=1e-12)
+
+
+def compare(system, path, t1, names, atol, inputs=None, **options):
+    """A run by CVode beside one by `simulate`, away from events."""
+    found = run(path, t1, names, rtol=1e-10, record_events=False, **options)
+    solution = simulate(
+        system, t1, rtol=1e-10, atol=1e-12, ts=jnp.asarray(np.clip(found["time"], 0, t1)), inputs=inputs
+    )
+    for name in names:
+        np.testing.assert_allclose(found[name], solution[name], atol=atol, err_msg=name)
+    return solution
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind, names, t1",
+    [
+        (Ball, ["c.h"], 3.0), (Thermostat, ["c.T", "c.on"], 20.05), (SampledPI, ["c.x"], 2.05),
+        (Stick, ["c.x", "c.v"], 3.0), (Bob, ["c.x", "c.y"], 2.0),
+        (Doubling, ["c.x", "c.y", "c.d"], 3.55), (Robertson, ["c.a", "c.b", "c.c"], 40.0),
+        (House, ["c.air", "c.wall", "c.q"], 30.0),
+    ],
+)  # fmt: skip
+def test_runs_are_those_of_simulate(tmp_path, kind, names, t1):
+    system = hybrid(kind, "c")
+    path = exported(system, tmp_path)
+    compare(system, path, t1, names, 1e-6)
+    compare(system, path, t1, names, 1e-6, fmi_type="CoSimulation")
+    check_derivatives(system, path, [n for n in names if n not in system.discretes and n not in system.states])
+
+
+@pytest.mark.slow
+def test_instances_in_threads_do_not_see_each_other(ball):
+    """Each of 40 balls is dropped from a height of its own, and bounces 250 times at one place."""
+
+    def bounced(fmu, k):
+        speeds = []
+        for j in range(250):
+            fmu.model.enterContinuousTimeMode()
+            fmu.model.setTime(0.01 * (j + 1))
+            fmu.model.setContinuousStates(np.array([-1e-12, -1.0 - k]).ctypes.data_as(model_pointer()), 2)
+            fmu.model.completedIntegratorStep()
+            fmu.model.enterEventMode()
+            fmu.update()
+            speeds.append(fmu.get("b.v")[0])
+        return np.array(speeds)
+
+    found: dict[int, np.ndarray] = {}
+    with contextlib.ExitStack() as stack:
+        instances = [stack.enter_context(opened(ball, {"b.h0": 1.0 + k / 100, "b.e": 0.5})) for k in range(40)]
+        threads = [threading.Thread(target=lambda k=k: found.update({k: bounced(instances[k], k)})) for k in range(40)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert [fmu.get("b.n")[0] for fmu in instances] == [250.0] * 40
+    for k in range(40):
+        np.testing.assert_allclose(found[k], 0.5 * (1.0 + k), rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind, least", [(Ball, 1000), (Thermostat, 50), (SampledPI, 200), (Stick, 3), (House, 0)])
+def test_sanitizers_find_nothing(tmp_path, kind, least):
+    """20,000 steps of Euler's method with events, derivatives and states that are saved, under the address and the
+    undefined-behaviour sanitizer, leaks included."""
+    with zipfile.ZipFile(exported(hybrid(kind, "c"), tmp_path)) as file:
+        file.extractall(tmp_path)
+    driver = Path(__file__).parent.parent / "fmu_driver.c"
+    command = [*(compiler_for(this_platform()) or ()), "-std=c99", "-O1", "-ffp-contract=off", "-Isources"]
+    sanitize = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    built = subprocess.run(
+        [*command, *sanitize, str(driver), "-o", "drive", "-lm"], cwd=tmp_path, capture_output=True, text=True
+    )
+    if "cannot find -lasan" in built.stderr:
+        pytest.skip("the compiler has no sanitizers")
+    assert not built.returncode, built.stderr
+    done = subprocess.run(["./drive", "20000", "1e-3"], cwd=tmp_path, capture_output=True, text=True)
+    assert not done.returncode, done.stdout + done.stderr
+    assert int(done.stdout.split()[-1]) >= least
+
+
+@pytest.mark.slow
+def test_a_large_array_stays_loops(tmp_path):
+    """The C code of 2,000 cells is hardly longer than that of 1,000, and every cell depends on its neighbours alone."""
+    sizes = []
+    for n in (1000, 2000):
+        path = exported(ladder(n, in_array=True), tmp_path, f"cells{n}", outputs=["cell[0].r.i"])
+        with zipfile.ZipFile(path) as file:
+            sizes.append(file.read("sources/model.c").decode().count(";"))
+    assert sizes[1] < 1.01 * sizes[0]
+    assert path.stat().st_size < 500_000
+    rng = np.random.default_rng(0)
+    with opened(path) as fmu:
+        derivatives = {u.variable.name: {v.name for v in u.dependencies} for u in fmu.description.derivatives}
+        for k in (1, 777, 1998):
+            own = {f"cell[{j}].c.v" for j in (k - 1, k, k + 1)}
+            own |= {f"cell[{k}].r.R", f"cell[{k + 1}].r.R", f"cell[{k}].c.C"}
+            assert derivatives[f"der(cell[{k}].c.v)"] == own
+        x = rng.normal(size=2000)
+        fmu.model.enterContinuousTimeMode()
+        fmu.model.setContinuousStates(x.ctypes.data_as(model_pointer()), 2000)
+        slopes = fmu.get(*(f"der(cell[{k}].c.v)" for k in range(2000)))
+    before, after = np.concatenate([[1.0], x[:-1]]), np.append(x[1:], x[-1])
+    np.testing.assert_allclose(slopes, before - x + after - x, atol=1e-12)
