@@ -174,8 +174,8 @@ def test_inductors_transformers_and_radiation(library):
 
     np.testing.assert_allclose(found["winding.i"], charged(20.0, 800.0), rtol=1e-6)
     by_N, by_Rm = jax.grad(lambda p: charged(*p)[-1])((20.0, 800.0))
-    assert slopes["winding.N"] == pytest.approx(by_N, rel=1e-5)
-    assert slopes["core.R_m"] == pytest.approx(by_Rm, rel=1e-5)
+    assert slopes["winding.N"] == pytest.approx(float(by_N), rel=1e-5)
+    assert slopes["core.R_m"] == pytest.approx(float(by_Rm), rel=1e-5)
     np.testing.assert_allclose(found["load.i"], 0.7 / 4.0 / 0.5, rtol=1e-9)
     assert slopes["transformer.n"] == pytest.approx(-0.7 / 16.0 / 0.5, rel=1e-7)
 
