@@ -174,8 +174,9 @@ class SystemPlan:
     def digest_of_states(self) -> str:
         """A digest of what the entries of a whole state mean: the names of states and of discrete variables."""
         names = [self.quantity_name[q] for q in (*self.states, *self.carried)]
-        discrete = () if self.events is None else self.flat.parameters.names[self.events.discrete]
-        return hashlib.sha256(repr((names, list(discrete))).encode()).hexdigest()
+        known = self.flat.parameters.names
+        discrete = [] if self.events is None else [known[int(k)] for k in self.events.discrete]
+        return hashlib.sha256(repr((names, discrete)).encode()).hexdigest()
 
     @property
     def n_state(self) -> int:
