@@ -106,16 +106,17 @@ def _by_entries(
     """The statements with an equation for each entry of a discrete array that stands alone on the left."""
     declared = {d.name for d in model.declarations if is_discrete(d.name)}
     for s in statements:
-        array = s.left.path if isinstance(s, tree.Equality) and isinstance(s.left, tree.Reference) else ""
-        if not isinstance(s, tree.Equality) or f"{array}[1]" not in declared or any(s.left.subscripts):  # type: ignore[union-attr]
+        if not (isinstance(s, tree.Equality) and isinstance(s.left, tree.Reference)) or any(s.left.subscripts):
             yield s
             continue
-        k = 1
-        while f"{array}[{k}]" in declared:
-            inside = isinstance(s.right, tree.Array) and k <= len(s.right.entries)
-            value = s.right.entries[k - 1] if inside else tree.Part(s.right, None, (tree.Number(k),))  # type: ignore[union-attr]
-            yield tree.Equality(tree.Reference((f"{array}[{k}]",)), value, s.line)
+        right, k = s.right, 1
+        while f"{s.left.path}[{k}]" in declared:
+            is_listed = isinstance(right, tree.Array) and k <= len(right.entries)
+            value = right.entries[k - 1] if is_listed else tree.Part(right, None, (tree.Number(k),))
+            yield tree.Equality(tree.Reference((f"{s.left.path}[{k}]",)), value, s.line)
             k += 1
+        if k == 1:
+            yield s
 
 
 def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool]) -> list[tree.Statement]:

@@ -207,7 +207,7 @@ end Arm;
 
 
 def test_an_arm_of_three_dimensional_parts_on_our_damper(library):
-    """(I + m l^2) phi'' = -m g l cos(phi) - d phi', by SciPy; its slopes by differences of that."""
+    """With the gravity of the library, 9.80665 m/s2: (I + m l^2) phi'' = -m g l cos(phi) - d phi', by SciPy; its slopes by differences of that."""
     Arm = library.component("Arm", source=ARM)
     assert [(p.name, p.potentials) for p in Arm.opened.ports] == [("axis", (("phi", "rad"),))]
     ev, d = EqnEnv(), AcausalDiagram()
@@ -227,7 +227,7 @@ def test_an_arm_of_three_dimensional_parts_on_our_damper(library):
     def phi(m, damping):
         inertia = 0.05 + 0.1 + m * 0.4**2
         swing = scipy.integrate.solve_ivp(
-            lambda t, x: [x[1], (-m * 9.81 * 0.4 * np.cos(x[0]) - damping * x[1]) / inertia], (0.0, 2.0), [0.2, 0.0],
+            lambda t, x: [x[1], (-m * 9.80665 * 0.4 * np.cos(x[0]) - damping * x[1]) / inertia], (0.0, 2.0), [0.2, 0.0],
             t_eval=ts, rtol=1e-12, atol=1e-12,
         )  # fmt: skip
         return swing.y[0]
