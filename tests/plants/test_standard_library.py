@@ -207,7 +207,7 @@ end Arm;
 
 
 def test_an_arm_of_three_dimensional_parts_on_our_damper(library):
-    """With the gravity of the library, 9.80665 m/s2: (I + m l^2) phi'' = -m g l cos(phi) - d phi', by SciPy; its slopes by differences of that."""
+    """(I + m l^2) phi'' = -m g l cos(phi) - d phi' with the library's gravity, by SciPy; its slopes by differences."""
     Arm = library.component("Arm", source=ARM)
     assert [(p.name, p.potentials) for p in Arm.opened.ports] == [("axis", (("phi", "rad"),))]
     ev, d = EqnEnv(), AcausalDiagram()
