@@ -184,6 +184,7 @@ MAY_BE_SKIPPED = (
     r"JAXONOMY_DAE_DATA names no folder",  # measured data, which are not part of the repository
     r"this processor does not run OpenBLAS' kernels",
     r"could not import 'casadi'",  # an extra of the benchmarks
+    r"MODELICA_LIBRARY does not name the folder",  # the Modelica Standard Library, which is not part of the repository
     r"no mappings are counted here",  # outside of Linux
 )
 

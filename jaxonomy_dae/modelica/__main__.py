@@ -1,4 +1,5 @@
-"""Runs a Modelica model: `python -m jaxonomy_dae.modelica model.bmo --csv out.csv --plot out.svg body.x body.v`."""
+"""Runs a Modelica model: `python -m jaxonomy_dae.modelica model.bmo --csv out.csv --plot out.svg body.x body.v`; or
+packs a library: `python -m jaxonomy_dae.modelica pack analog.zip Modelica.Electrical.Analog --root libraries`."""
 
 import argparse
 import csv
@@ -17,6 +18,7 @@ from ..run.system.acausal_compiler import AcausalCompiler
 from ..run.system.system import AcausalSystem
 from ..write.diagram import AcausalDiagram
 from ..write.environment import EqnEnv
+from . import packing
 from .flat_component import FlatComponent
 from .flat_model import FlatModel
 from .load import load
@@ -26,8 +28,12 @@ MOST_POINTS = 100_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Reads, compiles and runs a file; returns 1 if one of these fails, with the reason on the standard error."""
-    asked = _parser().parse_args(arguments)
+    """Reads, compiles and runs a file, or packs a library; returns 1 if that fails, with the reason on the standard
+    error."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given[:1] == ["pack"]:
+        return packing.main(given[1:])
+    asked = _parser().parse_args(given)
     jax.config.update("jax_enable_x64", True)
     try:
         flat = load(Path(asked.file), asked.model, asked.root)

@@ -43,7 +43,8 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
     """Splits the statements of a model."""
     found = list(_whens_in(model.equations))
     whens = _merged(found)
-    others = _with_choices((s for s in model.equations if s not in found) if found else model.equations, is_discrete)
+    rest = [s for s in model.equations if s not in found] if found else list(model.equations)
+    others = _with_choices(_by_entries(rest, model, is_discrete), is_discrete)
     algorithms = []
     for section in model.algorithms:
         inside = list(_whens_in(section))
@@ -97,6 +98,25 @@ def _merged(whens: list[tree.Branches]) -> list[tree.Branches]:
                 by_condition[condition] = len(out)
             out.append(s)
     return out
+
+
+def _by_entries(
+    statements: Iterable[tree.Statement], model: tree.Class, is_discrete: Callable[[str], bool]
+) -> Iterator[tree.Statement]:
+    """The statements with an equation for each entry of a discrete array that stands alone on the left."""
+    declared = {d.name for d in model.declarations if is_discrete(d.name)}
+    for s in statements:
+        if not (isinstance(s, tree.Equality) and isinstance(s.left, tree.Reference)) or any(s.left.subscripts):
+            yield s
+            continue
+        right, k = s.right, 1
+        while f"{s.left.path}[{k}]" in declared:
+            is_listed = isinstance(right, tree.Array) and k <= len(right.entries)
+            value = right.entries[k - 1] if is_listed else tree.Part(right, None, (tree.Number(k),))
+            yield tree.Equality(tree.Reference((f"{s.left.path}[{k}]",)), value, s.line)
+            k += 1
+        if k == 1:
+            yield s
 
 
 def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool]) -> list[tree.Statement]:

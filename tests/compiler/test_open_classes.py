@@ -1,5 +1,6 @@
 """Modelica classes become classes of components with open ports. NumPy only."""
 
+import csv
 import json
 import zipfile
 
@@ -11,6 +12,7 @@ from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.host import kept
 from jaxonomy_dae.library import electrical, thermal
 from jaxonomy_dae.modelica import Library, component
+from jaxonomy_dae.modelica.__main__ import main
 from jaxonomy_dae.modelica.front_end import FrontEnd
 from jaxonomy_dae.modelica.readable_sources import with_readable_parameters
 from jaxonomy_dae.modelica.shelf import pack
@@ -256,3 +258,21 @@ end Clutch;
     assert (copy / "Parts" / "Other" / "package.mo").read_text().startswith("within Parts;")
     (root / "Parts" / "Clutch.mo").write_text(clutch.replace("getTable1D", "getTable2D"))
     assert with_readable_parameters(root, copies) == root
+
+
+def test_a_library_is_packed_from_the_command_line(tmp_path, library, capsys):
+    file = tmp_path / "devices.zip"
+    assert main(["pack", str(file), "Devices", "--root", str(written_to(tmp_path))]) == 0
+    rows = {row["name"]: row for row in csv.DictReader((tmp_path / "devices.csv").read_text().splitlines())}
+    refused = {"Devices.OnePort", "Devices.Pipe", "Devices.Open"}
+    assert {name for name, row in rows.items() if row["state"] == "refused"} == refused
+    assert "is partial" in rows["Devices.OnePort"]["reason"]
+    for name in rows.keys() - refused:
+        counts = rows[name]
+        assert counts["state"] == "translated", name
+        assert int(counts["unknowns"]) == int(counts["equations"]) + int(counts["flows"]), name
+    assert f"{file}: {len(rows) - 3} of {len(rows)} classes" in capsys.readouterr().out
+    packed = Library(file)["Devices.Resistor"](EqnEnv(), "r", R=1.0)
+    assert packed.equations == library["Devices.Resistor"](EqnEnv(), "r", R=1.0).equations
+    assert main(["pack", str(file), "Nothing", "--root", str(written_to(tmp_path))]) == 1
+    assert "there is no 'Nothing' in" in capsys.readouterr().err

@@ -85,7 +85,6 @@ def test_parameters_stay_symbols(model):
 
 @pytest.mark.parametrize("model", SOURCES)
 def test_the_stored_dictionaries_are_those_of_rumoca(model):
-    pytest.importorskip("rumoca", reason="rumoca is not installed: pip install 'jaxonomy_dae[modelica]'")
     import rumoca
 
     assert without_places(rumoca.Session().loads(SOURCES[model], model=model).to_dict("dae")) == stored(model)
@@ -139,6 +138,5 @@ def test_what_is_not_read_is_said(dae, told):
     ],
 )
 def test_bad_sources(source, model, told):
-    pytest.importorskip("rumoca", reason="rumoca is not installed: pip install 'jaxonomy_dae[modelica]'")
     with pytest.raises(ModelError, match=told):
         load(source, model)

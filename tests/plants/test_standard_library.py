@@ -1,0 +1,240 @@
+"""Classes of the Modelica Standard Library 4.1.0 in plants with our own parts, beside closed forms and SciPy.
+
+Each plant stands for itself; those of one test share a diagram, a run and a gradient. `MODELICA_LIBRARY` names the
+folder of the library; without it the tests are skipped.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.optimize
+from device_library import standard_library
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae.library import electrical, rotational, thermal, translational
+from jaxonomy_dae.library.signal import Constant
+from jaxonomy_dae.modelica import Library
+from jaxonomy_dae.solvers import Rodas5P
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def library():
+    return Library(standard_library())
+
+
+def opened(library, path):
+    return library[f"Modelica.{path}"]
+
+
+def run_with_slopes(system, values, ts, names, of, solver=None):
+    """The values of variables, and the derivatives of the sum of the last values of `of` by parameters: no two of these
+    depend on the same parameter."""
+
+    def run(values):
+        options = {"ts": jnp.asarray(ts), "rtol": 1e-9, "atol": 1e-11, "solver": solver}
+        solution = simulate(system.with_parameters(values), float(ts[-1]), **options)
+        found = {n: solution[n] for n in names}
+        return sum(found[n][-1] for n in of), found
+
+    (_, found), slopes = jax.jit(jax.value_and_grad(run, has_aux=True))(values)
+    return found, slopes
+
+
+def test_an_amplifier_with_a_transistor(library):
+    """Currents of Ebers and Moll by hand, two equations for the voltages at B and C; their slopes by differences."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    q = opened(library, "Electrical.Analog.Semiconductors.NPN")(ev, "q")
+    rc, rb = electrical.Resistor(ev, "rc", R=1000.0), electrical.Resistor(ev, "rb", R=1e5)
+    v, g = electrical.VoltageSource(ev, "v", V=10.0), electrical.Ground(ev, "g")
+    d.add(q, rc, rb, v, g)
+    d.connect(v.n, g.p, q.E)
+    d.connect(v.p, rc.p, rb.p)
+    d.connect(rc.n, q.C)
+    d.connect(rb.n, q.B)
+    system = AcausalCompiler(ev, d)()
+    values = {"q.Bf": 50.0, "q.Vak": 0.02, "rb.R": 1e5}
+    found, slopes = run_with_slopes(system, values, [1e-4, 1e-3], ["q.C.v", "q.B.v"], ["q.C.v"], Rodas5P())
+
+    def by_hand(Bf, Vak, Rb):
+        def rest(x):
+            vb, vc = x
+            forward = 1e-16 * np.expm1(vb / 0.02585) + vb * 1e-15
+            back = 1e-16 * (np.exp(-100.0) * ((vb - vc) / 0.02585 + 101.0) - 1.0) + (vb - vc) * 1e-15
+            collector = (forward - back) * (1.0 - (vb - vc) * Vak) - back / 0.1
+            return [(10.0 - vc) / 1000.0 - collector, (10.0 - vb) / Rb - forward / Bf - back / 0.1]
+
+        return scipy.optimize.fsolve(rest, [0.8, 5.0], xtol=1e-14)
+
+    base = np.array([50.0, 0.02, 1e5])
+    np.testing.assert_allclose([found["q.B.v"][-1], found["q.C.v"][-1]], by_hand(*base), rtol=1e-8)
+    for k, name in enumerate(values):
+        up, down = (base * np.where(np.arange(3) == k, 1 + s * 1e-4, 1.0) for s in (1, -1))
+        expected = (by_hand(*up)[1] - by_hand(*down)[1]) / (up[k] - down[k])
+        assert slopes[name] == pytest.approx(expected, rel=1e-5), name
+
+
+def test_friction_gears_and_a_gap(library):
+    """A body on a bearing stops: it turns J w0^2/(2 tau). Two bodies on a clutch slip until their speeds are one. A
+    planetary gear divides a torque. A mass returns from an elastic stop after half a period."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    bearing = opened(library, "Mechanics.Rotational.Components.BearingFriction")(ev, "bearing", tau_pos=[[0.0, 1.5]])
+    clutch = opened(library, "Mechanics.Rotational.Components.Clutch")(ev, "clutch", fn_max=4.0)
+    gear = opened(library, "Mechanics.Rotational.Components.IdealPlanetary")(ev, "gear", ratio=2.0)
+    gap = opened(library, "Mechanics.Translational.Components.ElastoGap")(ev, "gap", c=200.0, d=0.0)
+    body = rotational.Inertia(ev, "body", J=2.0, initial_angle=0.0, initial_speed=3.0)
+    one = rotational.Inertia(ev, "one", J=1.0, initial_angle=0.0, initial_speed=10.0)
+    two = rotational.Inertia(ev, "two", J=3.0, initial_angle=0.0, initial_speed=0.0)
+    sun = rotational.Inertia(ev, "sun", J=0.5, initial_angle=0.0, initial_speed=0.0)
+    carrier = rotational.Inertia(ev, "carrier", J=4.0, initial_angle=0.0, initial_speed=0.0)
+    torque, force = rotational.Torque(ev, "torque"), Constant(ev, "force", 0.5)
+    level = Constant(ev, "level", 1.2)
+    ring = rotational.FixedAngle(ev, "ring")
+    mass = translational.Mass(ev, "mass", m=0.5, initial_position=0.1, initial_velocity=-1.0)
+    wall = translational.FixedPosition(ev, "wall")
+    d.add(bearing, clutch, gear, gap, body, one, two, sun, carrier, torque, force, level, ring, mass, wall)
+    d.connect(body.flange_a, bearing.flange_a)
+    d.connect(one.flange_a, clutch.flange_a)
+    d.connect(two.flange_a, clutch.flange_b)
+    d.connect(force.y, clutch.f_normalized)
+    d.connect(level.y, torque.tau)
+    d.connect(torque.flange, sun.flange_a, gear.sun)
+    d.connect(carrier.flange_a, gear.carrier)
+    d.connect(ring.flange, gear.ring)
+    d.connect(wall.flange, gap.flange_a)
+    d.connect(mass.flange, gap.flange_b)
+    system = AcausalCompiler(ev, d)()
+    values = {"body.J": 2.0, "bearing.tau_pos[1,2]": 1.5, "clutch.fn_max": 4.0, "gear.ratio": 2.0, "gap.c": 200.0}
+    ts = np.array([1.0, 3.0, 8.0])
+    names = ["body.phi", "one.w", "two.w", "sun.w", "carrier.w", "mass.s"]
+    found, slopes = run_with_slopes(system, values, ts, names, ["body.phi", "sun.w", "mass.s"])
+    stop = 2.0 * 3.0 / 1.5
+    t = np.minimum(ts, stop)
+    np.testing.assert_allclose(found["body.phi"], 3.0 * t - 0.75 * t**2 / 2, atol=1e-7)
+    friction = 0.5 * 4.0 * 0.5  # mu fn
+    lock = 10.0 / (friction / 1.0 + friction / 3.0)
+    np.testing.assert_allclose(found["one.w"], np.where(ts < lock, 10.0 - friction * ts, 2.5), atol=1e-7)
+    np.testing.assert_allclose(found["two.w"], np.where(ts < lock, friction * ts / 3.0, 2.5), atol=1e-7)
+    inertia = 0.5 + 4.0 / 9.0  # w_sun = (1 + ratio) w_carrier
+    np.testing.assert_allclose(found["sun.w"], 1.2 * ts / inertia, rtol=1e-7)
+    np.testing.assert_allclose(found["carrier.w"], 0.4 * ts / inertia, rtol=1e-7)
+    away = 0.1 + np.pi * np.sqrt(0.5 / 200.0)
+    np.testing.assert_allclose(found["mass.s"], ts - away, rtol=1e-7)
+    assert slopes["body.J"] == pytest.approx(9.0 / 3.0, rel=1e-6)
+    assert slopes["bearing.tau_pos[1,2]"] == pytest.approx(-2.0 * 9.0 / (2 * 1.5**2), rel=1e-6)
+    by_ratio = 1.2 * 8.0 / inertia**2 * 2 * 4.0 / 27.0
+    assert slopes["gear.ratio"] == pytest.approx(by_ratio, rel=1e-6)
+    assert slopes["gap.c"] == pytest.approx(np.pi * np.sqrt(0.5) / 2 * 200.0**-1.5, rel=1e-5)
+
+
+def test_inductors_transformers_and_radiation(library):
+    """A voltage on a saturating inductor gives its flux; a coil on a reluctance is an inductor N^2/Rm; two bodies
+    exchange heat by radiation."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    Saturating = opened(library, "Electrical.Analog.Basic.SaturatingInductor")
+    coil = Saturating(ev, "coil", start={"i": 0.0}, Inom=1.0, Lnom=1.0, Lzer=2.0, Linf=0.5)
+    winding = opened(library, "Magnetic.FluxTubes.Basic.ElectroMagneticConverter")(ev, "winding", N=20.0)
+    core = opened(library, "Magnetic.FluxTubes.Basic.ConstantReluctance")(ev, "core", R_m=800.0)
+    ground = opened(library, "Magnetic.FluxTubes.Basic.Ground")(ev, "ground")
+    transformer = opened(library, "Electrical.Analog.Ideal.IdealTransformer")(ev, "transformer", n=4.0, Lm1=1.0)
+    radiation = opened(library, "Thermal.HeatTransfer.Components.BodyRadiation")(ev, "radiation", Gr=0.01)
+    v, g = electrical.VoltageSource(ev, "v", V=0.7), electrical.Ground(ev, "g")
+    r, load = electrical.Resistor(ev, "r", R=3.0), electrical.Resistor(ev, "load", R=0.5)
+    hot, cold = thermal.HeatCapacitor(ev, "hot", 2e4, 900.0), thermal.HeatCapacitor(ev, "cold", 1e4, 300.0)
+    d.add(coil, winding, core, ground, transformer, radiation, v, g, r, load, hot, cold)
+    d.connect(v.p, coil.p, r.p, transformer.p1)
+    d.connect(v.n, g.p, coil.n, winding.n, transformer.n1, transformer.n2, load.n)
+    d.connect(r.n, winding.p)
+    d.connect(transformer.p2, load.p)
+    d.connect(winding.port_p, core.port_p)
+    d.connect(core.port_n, winding.port_n, ground.port)
+    d.connect(hot.heat, radiation.port_a)
+    d.connect(radiation.port_b, cold.heat)
+    system = AcausalCompiler(ev, d)()
+    values = {"coil.Linf": 0.5, "winding.N": 20.0, "core.R_m": 800.0, "transformer.n": 4.0, "radiation.Gr": 0.01}
+    ts = np.array([0.1, 0.5, 2.0])
+    names = ["coil.i", "winding.i", "load.i", "cold.T"]
+    found, slopes = run_with_slopes(system, values, ts, names, names)
+
+    def current(t, Linf=0.5):
+        Ipar = scipy.optimize.brentq(lambda k: 1.0 - Linf - (2.0 - Linf) * k * np.arctan(1.0 / k), 1e-6, 1e3)
+        return scipy.optimize.brentq(
+            lambda i: Linf * i + (2.0 - Linf) * Ipar * np.arctan(i / Ipar) - 0.7 * t, 1e-9, 50.0, xtol=1e-14
+        )
+
+    np.testing.assert_allclose(found["coil.i"], [current(t) for t in ts], rtol=1e-7)
+    by_Linf = (current(2.0, 0.5 + 1e-5) - current(2.0, 0.5 - 1e-5)) / 2e-5
+    assert slopes["coil.Linf"] == pytest.approx(by_Linf, rel=1e-4)
+
+    def charged(N, Rm):
+        return 0.7 / 3.0 * (1.0 - jnp.exp(-3.0 * jnp.asarray(ts) * Rm / N**2))
+
+    np.testing.assert_allclose(found["winding.i"], charged(20.0, 800.0), rtol=1e-6)
+    by_N, by_Rm = jax.grad(lambda p: charged(*p)[-1])((20.0, 800.0))
+    assert slopes["winding.N"] == pytest.approx(float(by_N), rel=1e-5)
+    assert slopes["core.R_m"] == pytest.approx(float(by_Rm), rel=1e-5)
+    np.testing.assert_allclose(found["load.i"], 0.7 / 4.0 / 0.5, rtol=1e-9)
+    assert slopes["transformer.n"] == pytest.approx(-0.7 / 16.0 / 0.5, rel=1e-7)
+
+    def cold_at(Gr):
+        sigma = 5.670374419e-8
+        flow = lambda T: Gr * sigma * (T[0] ** 4 - T[1] ** 4)  # noqa: E731
+        found = scipy.integrate.solve_ivp(
+            lambda t, T: [-flow(T) / 2e4, flow(T) / 1e4], (0.0, 2.0), [900.0, 300.0], rtol=1e-12, atol=1e-12
+        )
+        return found.y[1, -1]
+
+    assert found["cold.T"][-1] == pytest.approx(cold_at(0.01), rel=1e-9)
+    by_Gr = (cold_at(0.02) - cold_at(0.0)) / 0.02
+    assert slopes["radiation.Gr"] == pytest.approx(by_Gr, rel=1e-5)
+
+
+ARM = """
+model Arm "a body on a revolute joint; its shaft is open"
+  inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false, n = {0, -1, 0});
+  Modelica.Mechanics.MultiBody.Joints.Revolute joint(useAxisFlange = true, animation = false, n = {0, 0, 1});
+  Modelica.Mechanics.MultiBody.Parts.Body body(m = 1.5, r_CM = {0.4, 0, 0}, I_33 = 0.1, animation = false);
+  Modelica.Mechanics.Rotational.Interfaces.Flange_a axis;
+equation
+  connect(world.frame_b, joint.frame_a);
+  connect(joint.frame_b, body.frame_a);
+  connect(axis, joint.axis);
+end Arm;
+"""
+
+
+def test_an_arm_of_three_dimensional_parts_on_our_damper(library):
+    """(I + m l^2) phi'' = -m g l cos(phi) - d phi' with the library's gravity, by SciPy; its slopes by differences."""
+    Arm = library.component("Arm", source=ARM)
+    assert [(p.name, p.potentials) for p in Arm.opened.ports] == [("axis", (("phi", "rad"),))]
+    ev, d = EqnEnv(), AcausalDiagram()
+    arm, damper = Arm(ev, "arm"), rotational.Damper(ev, "damper", d=0.3)
+    wall, motor = (
+        rotational.FixedAngle(ev, "wall"),
+        rotational.Inertia(ev, "motor", J=0.05, initial_angle=0.2, initial_speed=0.0),
+    )
+    d.add(arm, damper, wall, motor)
+    d.connect(arm.axis, damper.flange_a, motor.flange_a)
+    d.connect(damper.flange_b, wall.flange)
+    system = AcausalCompiler(ev, d)()
+    values = {"arm.body.m": 1.5, "damper.d": 0.3}
+    ts = np.array([0.5, 1.0, 2.0])
+    found, slopes = run_with_slopes(system, values, ts, ["motor.phi"], ["motor.phi"])
+
+    def phi(m, damping):
+        inertia = 0.05 + 0.1 + m * 0.4**2
+        swing = scipy.integrate.solve_ivp(
+            lambda t, x: [x[1], (-m * 9.80665 * 0.4 * np.cos(x[0]) - damping * x[1]) / inertia], (0.0, 2.0), [0.2, 0.0],
+            t_eval=ts, rtol=1e-12, atol=1e-12,
+        )  # fmt: skip
+        return swing.y[0]
+
+    np.testing.assert_allclose(found["motor.phi"], phi(1.5, 0.3), atol=1e-6)
+    h = 1e-5
+    by_m = (phi(1.5 + h, 0.3) - phi(1.5 - h, 0.3))[-1] / (2 * h)
+    by_d = (phi(1.5, 0.3 + h) - phi(1.5, 0.3 - h))[-1] / (2 * h)
+    assert slopes["arm.body.m"] == pytest.approx(by_m, rel=1e-4)
+    assert slopes["damper.d"] == pytest.approx(by_d, rel=1e-4)
