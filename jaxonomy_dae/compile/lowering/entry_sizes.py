@@ -46,7 +46,7 @@ class EntrySizes:
             return True
         readers = chosen.template.readers_of_partials()[1]
         read = [k for k, positions in enumerate(readers) if slot in positions]
-        return bool(self._changed[chosen.parameter[np.ix_(rows, read)]].any())
+        return bool(self._changed[chosen.parameter[np.ix_(rows, np.array(read, np.int64))]].any())
 
     def _evaluated(self, group: int) -> np.ndarray:
         chosen = self.extended.groups[group]

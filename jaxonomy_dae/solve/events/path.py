@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from ...base.aliases import PyTree, Time
+from ...base.aliases import Numeric, PyTree, Time
 from ..adjoint.closure_conversion import any_member
 
 SUBSTEPS = (2, 4, 6, 8, 12, 16)  # of each column of the extrapolation: the last one is of order twelve
@@ -69,11 +69,11 @@ class _Piece(NamedTuple):
 class _At(NamedTuple):
     """A substep: its column, its number there, its part of the piece, the columns' weights, whether it ends one."""
 
-    column: Array
-    substep: Array
-    part: Array
-    weights: Array
-    ends: Array
+    column: Numeric
+    substep: Numeric
+    part: Numeric
+    weights: Numeric
+    ends: Numeric
 
 
 def path_end(
