@@ -110,9 +110,9 @@ def _by_entries(
             yield s
             continue
         right, k = s.right, 1
+        listed = right.entries if isinstance(right, tree.Array) else ()
         while f"{s.left.path}[{k}]" in declared:
-            is_listed = isinstance(right, tree.Array) and k <= len(right.entries)
-            value = right.entries[k - 1] if is_listed else tree.Part(right, None, (tree.Number(k),))
+            value = listed[k - 1] if k <= len(listed) else tree.Part(right, None, (tree.Number(k),))
             yield tree.Equality(tree.Reference((f"{s.left.path}[{k}]",)), value, s.line)
             k += 1
         if k == 1:
