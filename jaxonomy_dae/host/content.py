@@ -152,7 +152,7 @@ class _Walk:
                 return self.hidden(f"what is read of the module {part.__name__}")
             case enum.Enum():
                 self._name_of_class(kind)
-                return self.say("member", part.name)
+                return self.say("member", str(part.name), repr(part.value))
             case functools.partial():
                 self.say("partial")
                 return self.parts((part.func, part.args, part.keywords))

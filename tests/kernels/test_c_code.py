@@ -131,6 +131,8 @@ def compared(functions, folder, rtol, **options):
     found = in_c(functions, folder, **options)
     given = {name: given for name, (_, given) in functions.items()}
     expected = jax.jit(lambda all_given: {name: functions[name][0](*own) for name, own in all_given.items()})(given)
+    # Compiled without optimization, XLA's cube root of 1e-100 is off by 1.3e-14.
+    expected |= {name: np.cbrt(*given[name]) for name in given if name == "of_cbrt"}
     for name, own in given.items():
         agree(found[name](*own), expected[name], rtol, name)
 
@@ -147,6 +149,7 @@ def test_primitives_at_edge_values(tmp_path):
     compared(table(np.float64) | given, tmp_path, 4e-15)
 
 
+@pytest.mark.slow
 def test_arrays_and_control_flow(tmp_path):
     compared(ARRAYS, tmp_path, 1e-12)
 

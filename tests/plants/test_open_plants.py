@@ -21,7 +21,7 @@ def library(tmp_path_factory):
     kept._CHOSEN[:] = before
 
 
-@pytest.mark.long("a run with an event and gradients through it")
+@pytest.mark.slow
 def test_a_capacitor_is_charged_through_a_switch_and_a_heated_resistor(library):
     """C v' = (V - v)/R_all, R_all = R + 1/Goff before the switch closes, R + Ron afterwards; the heat in the resistor
     warms our capacity. The step that closes the switch is ours, its time a parameter."""
