@@ -40,13 +40,6 @@ _BESIDE = frozenset({
 })  # fmt: skip
 
 
-def _is_plain(member: object) -> bool:
-    """True for numbers, texts, members of enumerations, what has a name in a library, and tuples of such."""
-    if isinstance(member, tuple | frozenset):
-        return type(member) in (tuple, frozenset) and all(map(_is_plain, member))
-    return type(member) in _PLAIN or isinstance(member, enum.Enum) or (callable(member) and place(member) is not None)
-
-
 class HasContent(Protocol):
     """A part that says itself what it is, instead of being walked over."""
 
@@ -272,7 +265,7 @@ class _Walk:
             if module is None:
                 self.hidden(f"the import of {name}")
             else:
-                self._module(module, code.attributes, name)
+                self._module(module, code.attributes)
 
     def _value(self, value: Any, code: "_Code", name: str) -> None:
         """What a function reads by a name: of a module, the parts that its code names."""
@@ -280,9 +273,9 @@ class _Walk:
             return self.part(value)
         if name in code.bare and owner(value.__name__) is not Owner.KNOWN:
             return self.hidden(f"what is read of the module {value.__name__}")
-        self._module(value, code.attributes, name)
+        self._module(value, code.attributes)
 
-    def _module(self, module: types.ModuleType, names: tuple[str, ...], called: str, depth: int = 0) -> None:
+    def _module(self, module: types.ModuleType, names: tuple[str, ...], depth: int = 0) -> None:
         whose = owner(module.__name__)
         self.say("module", module.__name__)
         found = [name for name in names if name in vars(module)]
@@ -294,7 +287,7 @@ class _Walk:
             if not isinstance(value, types.ModuleType):
                 self.part(value)
             elif depth < len(names):
-                self._module(value, names, name, depth + 1)
+                self._module(value, names, depth + 1)
 
     # --- classes and objects ------------------------------------------------------------------------------------------
 
@@ -368,6 +361,13 @@ class _Walk:
 
 
 _BUILT_IN = frozenset({type(None), tuple, list, dict, set, frozenset, bool, int, float, complex, str, bytes})
+
+
+def _is_plain(member: object) -> bool:
+    """True for numbers, texts, members of enumerations, what has a name in a library, and tuples of such."""
+    if isinstance(member, tuple | frozenset):
+        return type(member) in (tuple, frozenset) and all(map(_is_plain, member))
+    return type(member) in _PLAIN or isinstance(member, enum.Enum) or (callable(member) and place(member) is not None)
 
 
 _TREES: dict[Any, bytes] = {}
