@@ -136,11 +136,6 @@ class _Reader:
             if name in SAME:
                 at.update(zip(equation.outvars, read, strict=True))
                 continue
-            if name == "in_batches":  # of `solve/linear/once.py`: what it does for one
-                kinds = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
-                alone = jax.make_jaxpr(params["way"].alone)(kinds).jaxpr
-                at.update(zip(equation.outvars, self.inside(alone, read), strict=True))
-                continue
             if name in CALLS:
                 inner, closed = open_program(params[CALLS[name]])
                 if len(inner.eqns) <= SMALL:

@@ -2,16 +2,17 @@
 
 A kernel for CPUs computes anew what it reads, if that is cheap, and what that reads again: sums of products that many
 outputs share, exponentially often. What a call returns that XLA does not take apart is computed once.
+
+Functions with a `custom_vmap` that are differentiated have one argument, and return what is not batched as such. JAX
+(0.10.2) batches twice what only the tangents of one of several arguments have in batches; a `custom_jvp` around it does
+not help within loops, where JAX forgets it when it takes a gradient: Hessians of steady states failed.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 
 from ...base.private_names import MissingName, private
 from ...host.platform import platform
@@ -30,7 +31,7 @@ def stacked(rows: Sequence[Any]) -> Any:
 def once(values: Sequence[Any], in_batches_only: bool = False) -> list[Any]:
     """Arrays of one shape, computed once; perhaps only if they are batched: to read them back costs time, too, more
     than a few scalars do."""
-    return list(_in_batches.bind(*values, way=_EACH)) if in_batches_only else _once(values)
+    return _once_in_batches(list(values)) if in_batches_only else _once(values)
 
 
 def _once(values: Sequence[Any]) -> list[Any]:
@@ -38,68 +39,65 @@ def _once(values: Sequence[Any]) -> list[Any]:
     return [rows[k] for k in range(len(values))]
 
 
+@jax.custom_batching.custom_vmap
+def _once_in_batches(values):
+    return values
+
+
+@_once_in_batches.def_vmap
+def _(size, batched, values):
+    (batched,) = batched
+    if not any(batched):
+        return values, batched
+    values = [v if b else jnp.broadcast_to(v, (size, *v.shape)) for v, b in zip(values, batched, strict=True)]
+    return _once(values), [True] * len(values)
+
+
+@jax.custom_jvp
 def once_in_batches(vector: Any) -> Any:
     """The vector; in a batch it is computed once, and each entry lies together for all members: its readers read
     entries, and XLA would add these up anew for each of them, across the members."""
-    return _in_batches.bind(vector, way=_VECTOR)[0]
+    return _together(vector)
 
 
-def stacked_in_batches(values: Sequence[Any]) -> Any:
+@once_in_batches.defjvp
+def _(primals, tangents):
+    return once_in_batches(*primals), *tangents  # JAX has no transpose of a `custom_vmap` function
+
+
+@jax.custom_batching.custom_vmap
+def _together(vector):
+    return vector
+
+
+@_together.def_vmap
+def _(size, batched, vector):
+    del size
+    return (joined([vector.T]).T, True) if batched[0] else (vector, False)
+
+
+@jax.custom_jvp
+def stacked_in_batches(values: list[Any]) -> Any:
     """Scalars as a vector. In a batch each is computed by a loop of its own: XLA would compute all within the one that
     puts them together, anew for each of them and without vector instructions, which took five times as long for
     10,000 pendulums."""
-    dtype = jnp.result_type(*values)
-    return _in_batches.bind(*(jnp.asarray(value, dtype) for value in values), way=_STACK)[0]
+    return _stacked_together(jnp.stack(values))
 
 
-class _Way(NamedTuple):
-    """A linear function: of arrays, and of arrays that all have the batch in front."""
-
-    name: str
-    alone: Callable[[Sequence[Any]], list[Any]]
-    batched: Callable[[Sequence[Any]], list[Any]]
+@stacked_in_batches.defjvp
+def _(primals, tangents):
+    return stacked_in_batches(*primals), jnp.stack(tangents[0])
 
 
-_EACH = _Way("each", list, _once)
-_VECTOR = _Way("vector", list, lambda values: [joined([values[0].T]).T])
-_STACK = _Way("stack", lambda values: [jnp.stack(values)], lambda values: [stacked(values).T])
-
-# A primitive, not a `jax.custom_batching.custom_vmap` function. JAX cannot batch the derivative of one (jax 0.10.2: it
-# batches twice what only the tangents have in batches), and forgets, when it takes a gradient, rules of `custom_jvp` by
-# which one could help oneself: the Hessian of a steady state failed.
-_in_batches = Primitive("in_batches")
-_in_batches.multiple_results = True
+@jax.custom_batching.custom_vmap
+def _stacked_together(vector):
+    return vector
 
 
-@_in_batches.def_impl
-def _(*values: Any, way: _Way) -> list[Any]:
-    return way.alone(values)
-
-
-@_in_batches.def_abstract_eval
-def _(*values: Any, way: _Way) -> list[Any]:
-    if way is _STACK:
-        return [ShapedArray((len(values), *values[0].shape), values[0].dtype)]
-    return [ShapedArray(value.shape, value.dtype) for value in values]
-
-
-def _batched(values: Sequence[Any], axes: Sequence[Any], *, way: _Way) -> tuple[list[Any], list[int]]:
-    size = next(v.shape[axis] for v, axis in zip(values, axes, strict=True) if axis is not None)
-    spread = [
-        jnp.broadcast_to(v, (size, *v.shape)) if axis is None else jnp.moveaxis(v, axis, 0)
-        for v, axis in zip(values, axes, strict=True)
-    ]
-    found = way.batched(spread)
-    return found, [0] * len(found)
-
-
-def _derivative(values: Sequence[Any], tangents: Sequence[Any], *, way: _Way) -> tuple[list[Any], list[Any]]:
-    return _in_batches.bind(*values, way=way), way.alone([ad.instantiate_zeros(tangent) for tangent in tangents])
-
-
-batching.primitive_batchers[_in_batches] = _batched
-ad.primitive_jvps[_in_batches] = _derivative
-mlir.register_lowering(_in_batches, mlir.lower_fun(lambda *values, way: way.alone(values), multiple_results=True))
+@_stacked_together.def_vmap
+def _(size, batched, vector):
+    del size
+    return (stacked(list(jnp.unstack(vector, axis=1))).T, True) if batched[0] else (vector, False)
 
 
 @jax.jit
