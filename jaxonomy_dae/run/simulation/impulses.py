@@ -78,8 +78,8 @@ class _Impact(eqx.Module):
             return solved(change.dtype) * jnp.concatenate([states, pushed])
 
         moves = jnp.any(strength != 0)
-        # Not an array without entries: XLA (jaxlib 0.10.2) passes those on through nested loops, one at a time, gives up
-        # after ten, and then compiles no call of LAPACK that it has not come to.
+        # Not an array without entries: XLA (jaxlib 0.10.2) passes those on through nested loops, one at a time, gives
+        # up after ten, and then compiles no call of LAPACK that it has not come to.
         guess = self.x[n:] if len(self.x) > n else None
         end, guess, found = path_end(direction, begin, guess, allowed, moves)
         after = end[:n] if guess is None else jnp.append(end[:n], guess)
