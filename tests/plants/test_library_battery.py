@@ -93,7 +93,8 @@ def test_energy_of_cells():
 
 HEATED = {"cell.Q": 2.2, "cell.R0": 0.04, "cell.R1": 0.02, "cell.C1": 1.5e3, "cell.Ea": 2.5e4, "cell.dUdT": 3e-4,
           "cell.gas_constant": GAS, "cell.T_ref": 298.15, "cell.initial_soc": 0.9, "cell.initial_voltage1": -0.01,
-          "cell.eta": 0.97, "body.C": 45.0, "body.initial_temperature": 285.0, "skin.h": 5.0, "skin.A": 0.004, "air.T": 280.0, "load.R": 0.9,
+          "cell.eta": 0.97, "body.C": 45.0,
+          "body.initial_temperature": 285.0, "skin.h": 5.0, "skin.A": 0.004, "air.T": 280.0, "load.R": 0.9,
           **{f"cell.ocv{k}": float(v) for k, v in enumerate(OCV, 1)}}  # fmt: skip
 END = 1500.0
 
