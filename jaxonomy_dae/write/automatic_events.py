@@ -199,6 +199,8 @@ class _Rewriting:
             return _FORMS[type(e)](functools.partial(self._turns, [e]), functools.partial(self._stepping, e), *inside)
         if all(new is old for new, old in zip(inside, e.args, strict=True)):
             return e
+        if isinstance(e, sympy.Pow):  # SymPy would draw a power into branches, and compare what is not a number there
+            return sympy.Pow(*inside, evaluate=False)
         return e.func(*inside)
 
     def _piecewise(self, e: Expression) -> Expression:
