@@ -193,14 +193,12 @@ class _Rewriting:
         if not e.args or isinstance(e, Smooth):
             return e
         inside = [self.new[a] for a in e.args]
-        if _has_an_end(e):
+        if _has_an_end(e) and not e.args[0].is_number:
             inside[0] = self._within_domain(e, inside[0])
         if isinstance(e, KINKED) and e in self.varying:
             return _FORMS[type(e)](functools.partial(self._turns, [e]), functools.partial(self._stepping, e), *inside)
         if all(new is old for new, old in zip(inside, e.args, strict=True)):
             return e
-        if isinstance(e, sympy.Pow):  # SymPy would draw a power into branches, and compare what is not a number there
-            return sympy.Pow(*inside, evaluate=False)
         return e.func(*inside)
 
     def _piecewise(self, e: Expression) -> Expression:
