@@ -54,6 +54,8 @@ class Minimum:
     noise: float  # relative error of the Jacobian: directions within it count as not determined
     left: float  # what is left to go, in radii of the confidence region
     tolerance: float  # of the integration, relative
+    # The integration's error in units of the noise, root of the sum of squares; NaN where it was not measured.
+    resolution: float = dataclasses.field(default=np.nan, kw_only=True)
 
 
 # Better weights, and by which part noise levels and precisions change. The last argument: whether the point is a

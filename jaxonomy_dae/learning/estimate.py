@@ -20,7 +20,7 @@ from .discovery import Discovery, discover
 from .experiment import Experiment
 from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
-from .identifiability import Identifiability, identifiability, spreads
+from .identifiability import Identifiability, identifiability, natural_scale, spreads
 from .intervals import intervals, noise_intervals, profile
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
@@ -237,7 +237,16 @@ class Estimate:
         noise levels have χ² intervals. With `white=False` the intervals hold if residuals are correlated in time."""
         noise = noise_intervals(self.objective, self.minimum, self.root, level)
         spread = self.spread if white else self.correlated_spread
-        return intervals(self.objective, self.point, spread, self.quantile(level), level, noise)
+        return intervals(self.objective, self.point, spread, self._unknown, self.quantile(level), level, noise)
+
+    @functools.cached_property
+    def _unknown(self) -> Float[np.ndarray, " p"]:
+        """The spread at which each coordinate counts as not determined: a factor of e, or half of what a number without
+        a scale of its own would have to change by to matter, of which an interval then contains all."""
+        c, m, free = self.objective.coordinates, self.minimum, self.objective.free
+        out = np.full(len(c), np.inf)
+        out[free] = natural_scale(self.objective, m.z, m.found)
+        return np.where(c.log | np.isfinite(c.spread), out, out / 2)
 
     def identifiability(self) -> Identifiability:
         """The directions that the data determine, at the values found."""
@@ -308,7 +317,7 @@ class Estimate:
 
     def score(self, experiment: Experiment, *, first: int | None = None) -> Score:
         """Scores the prediction of a new experiment. Its unknown starts are fitted to its `first` rows (default: all),
-        which count, too.
+        which count, too. Where it has no `sigma`, that of the fit counts.
 
         ```python
         print(fit.score(learning.Experiment(ts, {"pend.x": x}, initial={"pend.theta": 0.3})))

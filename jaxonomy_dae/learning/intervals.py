@@ -78,10 +78,11 @@ def profile(
 
 
 def intervals(
-    objective: Objective, point: Float[np.ndarray, " p"], spreads: Float[np.ndarray, " p"], factor: float, level: float,
-    noise: list[Row],
+    objective: Objective, point: Float[np.ndarray, " p"], spreads: Float[np.ndarray, " p"],
+    scale: Float[np.ndarray, " p"], factor: float, level: float, noise: list[Row],
 ) -> Table:  # fmt: skip
-    """As `Estimate.table`: parameters and starts, with what is to be said of each, and noise levels."""
+    """As `Estimate.table`: parameters and starts, with what is to be said of each, and noise levels. `scale`: the spread
+    at which a coordinate counts as not determined."""
     c = objective.coordinates
     low, high = c.z_bounds
     natural = c.natural(point)
@@ -93,6 +94,8 @@ def intervals(
         ends = z - factor * spread, z + factor * spread
         if k not in moved:
             note = "frozen" if c.fixed[k] else "held out: fitted to this experiment alone"
+            if not c.fixed[k] and objective.has_no_weight[k]:
+                note = "no weight: kept at its guess"
         elif z <= low[k] or z >= high[k]:
             note = f"bound reached: {natural[k]:g}"
         elif away[k]:
@@ -100,7 +103,7 @@ def intervals(
             spread = np.inf
         elif np.isfinite(c.spread[k]) and spread > SILENT * c.spread[k]:
             note = "by its prior"
-        elif spread >= 1:
+        elif spread >= scale[k]:
             note = "not determined"
         inside = (-np.inf, np.inf)
         if np.isfinite(spread):

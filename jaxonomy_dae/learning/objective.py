@@ -65,9 +65,10 @@ class Predicted:
 
 
 FINEST = 1e3  # roundings, to which an integration of some hundred steps can be told to keep
-# Factor, or change in its own size, by which a number without bounds may leave the start of its search: a guess in
-# another unit (nano) is still within reach, and what runs further is not held by the data.
+# Factor by which a positive number without bounds may leave the start of its search: a guess in another unit (nano) is
+# still within reach, and what runs further is not held by the data.
 AWAY = 1e9
+FAR = AWAY**2  # the same of other numbers in units of their start, which may itself be next to nothing
 FEW = 8  # columns up to which residuals alone cost almost as much as with their Jacobian, and a program of their own
 MANY = 40  # numbers of one experiment beyond which a gradient backwards costs less: of 97, 6 ms where forwards it is 14
 
@@ -125,11 +126,20 @@ class Objective:
 
     @functools.cached_property
     def free(self) -> Bool[np.ndarray, " p"]:
-        """The coordinates that are searched: not frozen, and not of an experiment that does not count."""
+        """The coordinates that are searched: not frozen, and not of an experiment that does not count or has no weight."""
         c = self.coordinates
-        owner = np.repeat(np.arange(len(self.counted)), c.n_own)
-        counts = np.concatenate([np.ones(c.n_shared, bool), self.counted[owner]])
-        return ~c.fixed & counts
+        return ~c.fixed & self.owned(self.counted, shared=True) & ~self.has_no_weight
+
+    @property
+    def has_no_weight(self) -> Bool[np.ndarray, " p"]:
+        """True for the own coordinates of experiments of weight zero, of which nothing is asked."""
+        return self.owned(self.stacked.weight == 0)
+
+    def owned(self, each: Bool[np.ndarray, " e"], shared: bool = False) -> Bool[np.ndarray, " p"]:
+        """For each coordinate, what holds of the experiment that owns it, or of those that experiments share."""
+        c = self.coordinates
+        owner = np.repeat(np.arange(len(each)), c.n_own)
+        return np.concatenate([np.full(c.n_shared, shared), each[owner]])
 
     @functools.cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +152,7 @@ class Objective:
         """(lower, upper) ends of a search for the free coordinates, shape (f,) each: bounds, and where there is none,
         so far from the start that the data do not hold the coordinate."""
         c, (low, high) = self.coordinates, self.bounds
-        reach = np.where(c.is_weight, np.inf, np.where(c.log, np.log(AWAY), AWAY))[self.free]
+        reach = np.where(c.is_weight, np.inf, np.where(c.log, np.log(AWAY), FAR))[self.free]
         start = c.z_start[self.free]
         return np.where(np.isfinite(low), low, start - reach), np.where(np.isfinite(high), high, start + reach)
 

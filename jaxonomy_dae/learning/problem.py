@@ -32,6 +32,7 @@ from .priors import priors_by_name
 from .program import AbstractPredictor, Layout, Runs, Setting
 from .progress import reporter
 from .ranges import in_ranges
+from .resolution import resolved
 from .runs import residuals, run, why_not
 from .smoother import smoother
 from .starting_points import adam_steps, starting_points
@@ -260,8 +261,8 @@ class Problem:
         zero, whichever is closer to the data. The weights of a raw `equinox.nn.MLP` are measured by the ranges of its
         inputs and the size of its outputs, so units do not matter. If both starts are far from the data, horizons grow.
         If a network ends where χ² is improbable, up to two more drawn starts are tried.
-        If no step reduces the cost, the search measures the error of the integration, and tightens the tolerances if
-        that error is the cause.
+        At the minimum, the error of the integration is measured. If it counts beside the noise, the search goes on with
+        tighter tolerances; so it does if no step reduces the cost because of that error.
 
         **Raises:**
 
@@ -306,6 +307,8 @@ class Problem:
         if best is None:
             raise SimulationError(why_not(objective))
         _, here, lowest, training = best
+        if not isinstance(self.method, Shooting):
+            here, lowest = resolved(here, lowest, steps)
         here = dataclasses.replace(here, watch=None)
         fit = Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
         if warn and fit.reasons:

@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..compile.diagnosis.wording import listed
+from .held_out import missed
 from .leftover import LEVEL, Leftover
 from .objective import AWAY
+from .resolution import EXACT, NOTICED
 
 if TYPE_CHECKING:
     from .estimate import Estimate
 
 SINGLE = 1e-2  # probability of a single test below which it is named, once all tests together doubt the model
-FAINT = 10.0  # times the integration's tolerance: residuals below are its error, which is never white
+FAINT = 10.0  # times the tolerance of an integration that cannot be finer: residuals below are its error
 BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
 
 
@@ -28,7 +30,7 @@ def reasons(fit: "Estimate") -> tuple[str, ...]:
     found = []
     if not fit.minimum.converged:
         found.append(f"{fit.message}: start elsewhere, with starts=5 or horizons=(0.1, 0.3, 1), or allow more steps=")
-    for check in (_leftover, _table):
+    for check in (_resolution, _leftover, _held_out, _table):
         found.extend(check(fit))
     return tuple(found)
 
@@ -99,7 +101,34 @@ def _is_faint(fit: "Estimate", label: str, name: str) -> bool:
     s = fit.objective.stacked
     size = float(np.nanmax(np.abs(s.values[s.labels.index(label), :, s.outputs.index(name)]), initial=0.0))
     rms = float(np.sqrt(np.nanmean(fit.residuals[label][name] ** 2)))
-    return fit.rms[label][name] < FAINT * fit.minimum.tolerance * size or rms < BELOW
+    least = EXACT if fit.minimum.resolution <= NOTICED else max(EXACT, FAINT * fit.minimum.tolerance)
+    return fit.rms[label][name] < least * size or rms < BELOW
+
+
+def _resolution(fit: "Estimate") -> list[str]:
+    """The integration's error, if it counts beside the noise and could not be made less."""
+    error = fit.minimum.resolution
+    if not error > NOTICED or all(_is_faint(fit, label, name) for label, by in fit.residuals.items() for name in by):
+        return []
+    return [
+        f"errors of the integration move estimates by up to {error:.2g} of their standard deviations, and runs at a "
+        f"tolerance below {fit.minimum.tolerance:.0e} fail: allow more with max_steps=, or use method=Shooting() for "
+        "runs that diverge"
+    ]
+
+
+def _held_out(fit: "Estimate") -> list[str]:
+    """Experiments held out that are missed by more than noise and intervals explain."""
+    found = missed(fit.objective, fit.point, fit.root, fit.sigma, fit.freedom)
+    if not found:
+        return []
+    worst = max(found, key=lambda label: found[label][0] / found[label][1])
+    rms, expected = found[worst]
+    others = f", and {len(found) - 1} other experiments held out" if len(found) > 1 else ""
+    return [
+        f"'{worst}', which was held out, is missed by {rms:.3g} σ where noise and intervals make it {expected:.2g}"
+        f"{others}: what was fitted does not carry over. Fit it, too, by holdout=False, and look which residuals stay"
+    ]
 
 
 def _table(fit: "Estimate") -> list[str]:
@@ -110,7 +139,7 @@ def _table(fit: "Estimate") -> list[str]:
     away = [row.name for row in rows if row.note == "ran away"]
     if away:
         found.append(
-            f"nothing in the data keeps {listed(away, 6)} from running away, to {AWAY:.0e} times its start: begin "
+            f"nothing in the data keeps {listed(away, 6)} from running away, further than {AWAY:.0e} times its start: begin "
             "closer, freeze it, or give it a prior, priors=, or bounds="
         )
     if ends:
