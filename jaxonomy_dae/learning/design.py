@@ -11,8 +11,8 @@ inverse takes the place of det H (Ds-optimality, ibid. §10.3), so that what is 
 helps.
 
 What is not known at all is taken to be known to its natural scale (`identifiability`): a positive parameter to a
-factor of e, another to its own size or what moves predictions as much as data vary, an unknown start to its spread. So directions that nothing determines yet have a finite worth (Chaloner
-& Verdinelli 1995, Statistical Science 10:273).
+factor of e, another to its own size or what moves predictions as much as data vary, an unknown start to its spread. So
+directions that nothing determines yet have a finite worth (Chaloner & Verdinelli 1995, Statistical Science 10:273).
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ import scipy.linalg
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from ..base.errors import InitializationError, ModelError, SimulationError, nearest, whole_number
+from ..base.errors import InitializationError, ModelError, SimulationError, explained_keywords, nearest, whole_number
 from .coordinates import Coordinates
 from .data import Stacked
 from .estimate import Estimate
@@ -144,6 +144,7 @@ def _chosen(
     return chosen[: c.n_shared][shared]
 
 
+@explained_keywords()
 def next_experiment(
     source: Problem | Estimate,
     candidates: Sequence[Planned],

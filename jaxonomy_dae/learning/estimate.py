@@ -9,7 +9,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from ..base.errors import ModelError, nearest
+from ..base.errors import ModelError, explained_keywords, nearest
 from ..base.optional import Axes
 from ..run.system.system import AcausalSystem
 from .agreement import Whiteness, correlated, log_likelihood, rms_by_name, whiteness
@@ -231,6 +231,7 @@ class Estimate:
             return float(scipy.stats.t.ppf(upper, max(self.freedom, 1.0)))
         return float(scipy.stats.norm.ppf(upper))
 
+    @explained_keywords()
     def table(self, level: float = 0.95, *, white: bool = True) -> Table:
         """Parameters and starts with linearized intervals on the coordinates' scale, so that intervals of positive
         parameters are positive. Notes mark values that reached a bound, are not determined, or were frozen. Estimated
@@ -253,6 +254,7 @@ class Estimate:
         m = self.minimum
         return identifiability(self.objective, m.weights, m.found, m.z, self.minimum.noise)
 
+    @explained_keywords()
     def profile(self, names: Sequence[str] | str, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Intervals by profile likelihood: inside them the cost, with everything else refitted, exceeds the minimum by
         less than half a quantile of χ². They need no linearization. An infinite end is not determined.
@@ -279,6 +281,7 @@ class Estimate:
 
     # --- what follows ------------------------------------------------------------------------------------------
 
+    @explained_keywords()
     def band(
         self,
         name: str,
@@ -299,6 +302,7 @@ class Estimate:
         """
         return band(self, name, grid, law, along, self.quantile(level))
 
+    @explained_keywords()
     def predict(
         self, names: str | Sequence[str], ts: Any = None, experiment: int | str | Experiment = 0, level: float = 0.95,
         *, first: int | None = None,
@@ -315,6 +319,7 @@ class Estimate:
         objective, point, root, experiment = self._under(experiment, first)
         return prediction(objective, point, root, names, ts, experiment, self.quantile(level))
 
+    @explained_keywords()
     def score(self, experiment: Experiment, *, first: int | None = None) -> Score:
         """Scores the prediction of a new experiment. Its unknown starts are fitted to its `first` rows (default: all),
         which count, too. Where it has no `sigma`, that of the fit counts.
@@ -339,6 +344,7 @@ class Estimate:
         `along`."""
         return explored(self, name, along)
 
+    @explained_keywords()
     def sample(self, draws: int = 500, *, chains: int = 4, warmup: int = 150, seed: int = 0) -> "Posterior":
         """Samples of the posterior density, whose maximum is the fit, by the No-U-Turn sampler (Hoffman & Gelman 2014;
         extra `bayes`). Use it if intervals from a linearization are not good enough.
@@ -400,6 +406,7 @@ class Estimate:
         − 2 ln L (Schwarz), for p coordinates and n samples."""
         return log_likelihood(self.minimum)
 
+    @explained_keywords()
     def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:
         """Replaces a network by closed forms: combinations of terms that are refitted to the data through the model,
         together with all other unknowns, and compared by BIC.

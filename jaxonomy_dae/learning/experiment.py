@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jax.typing import ArrayLike
 
-from ..base.errors import ModelError, nearest, whole_number
+from ..base.errors import ModelError, explained, nearest, whole_number
 from ..compile.lowering.plan import SystemPlan
 from .noise import ESTIMATE, Noise
 from .priors import is_finite
@@ -23,6 +23,7 @@ Samples: TypeAlias = float | tuple[Numbers, Numbers] | tuple[Numbers, Numbers, s
 UNEVEN = 1e-3  # of a time step, by which steps may differ and still count as even
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class Unknown:
     """A start that is estimated.
@@ -43,6 +44,7 @@ class Unknown:
             raise ModelError(f"Unknown: spread is a standard deviation > 0, or None; got {self.spread!r}")
 
 
+@explained
 @dataclasses.dataclass(frozen=True, eq=False)
 class Experiment:
     """One record.
@@ -382,6 +384,7 @@ def _cells(texts: list[str]) -> np.ndarray | list[str]:
         return texts
 
 
+@explained
 @dataclasses.dataclass(frozen=True, eq=False)
 class Planned:
     """An experiment that could be made, for `learning.next_experiment`.

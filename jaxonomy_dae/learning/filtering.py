@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..base.errors import ModelError, nearest, whole_number
+from ..base.errors import ModelError, explained, nearest, whole_number
 from ..run.system.system import AcausalSystem
 from .coordinates import Coordinate
 from .data import Stacked
@@ -25,6 +25,7 @@ FAR = 1e6  # how far, as a factor, a level may move from its guess: beyond, it c
 HIDDEN = 0.1  # guessed noise of a state that was not measured, relative to measured ones, each in units of its size
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class Filter:
     """Process noise, for `Problem(method=...)`: the equations hold up to white noise,
@@ -59,6 +60,7 @@ class Filter:
         whole_number(self.substeps, "Filter: substeps")
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class Innovations:
     """Predictions one step ahead, for `Problem(method=...)`: each sample moves the states by a constant gain K times

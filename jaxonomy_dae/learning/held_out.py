@@ -4,8 +4,8 @@ With u the residuals of a held-out experiment in units of the noise, and A Aᵀ 
 of all estimates, a right model leaves |u|² = Σ (1 + s²)·χ²₁, with the singular values s of A. A scaled χ² of the same
 mean and variance stands for this sum (Satterthwaite 1946, Biometrics Bulletin 2:110). Weighted by the inverse of the
 covariance instead, small errors of A in its longest direction, where predictions are not linear in what was estimated,
-doubt right models: 90 of 240 that were fitted to a tenth of a swing and held against ten of them. Starts that are fitted
-to the experiment alone take their directions out of u, A and the degrees of freedom. Where the noise level was
+doubt right models: 90 of 240 that were fitted to a tenth of a swing and held against ten of them. Starts that are
+fitted to the experiment alone take their directions out of u, A and the degrees of freedom. Where the noise level was
 estimated, Fisher's F takes the place of χ².
 """
 
@@ -64,6 +64,6 @@ def missed(
     return found
 
 
-def left_by(taken: Float[np.ndarray, "n k"], a: Float[np.ndarray, "n *r"]) -> Float[np.ndarray, "n *r"]:
-    """The part of columns that is orthogonal to others of length one."""
+def left_by(taken: Float[np.ndarray, "n k"], a: np.ndarray) -> np.ndarray:
+    """The part of columns, shape (n,) or (n, r), that is orthogonal to others of length one."""
     return a - taken @ (taken.T @ a)

@@ -9,9 +9,10 @@ import scipy.optimize
 import scipy.stats
 from jaxtyping import Float
 
+from .coordinates import end_text
 from .descent import Minimum
 from .evaluation import Weights
-from .objective import Objective
+from .objective import AWAY, Objective
 from .table import Row, Table
 
 FURTHEST = 10  # doublings of the linear interval before an end counts as infinite
@@ -81,8 +82,8 @@ def intervals(
     objective: Objective, point: Float[np.ndarray, " p"], spreads: Float[np.ndarray, " p"],
     scale: Float[np.ndarray, " p"], factor: float, level: float, noise: list[Row],
 ) -> Table:  # fmt: skip
-    """As `Estimate.table`: parameters and starts, with what is to be said of each, and noise levels. `scale`: the spread
-    at which a coordinate counts as not determined."""
+    """As `Estimate.table`: parameters and starts, with what is to be said of each, and noise levels. `scale`: the
+    spread at which a coordinate counts as not determined."""
     c = objective.coordinates
     low, high = c.z_bounds
     natural = c.natural(point)
@@ -97,7 +98,7 @@ def intervals(
             if not c.fixed[k] and objective.has_no_weight[k]:
                 note = "no weight: kept at its guess"
         elif z <= low[k] or z >= high[k]:
-            note = f"bound reached: {natural[k]:g}"
+            note = f"bound reached: {end_text(natural[k])}"
         elif away[k]:
             note = "ran away"
             spread = np.inf
@@ -106,7 +107,8 @@ def intervals(
         elif spread >= scale[k]:
             note = "not determined"
         inside = (-np.inf, np.inf)
-        if np.isfinite(spread):
+        # A factor beyond which no search goes says nothing, however many digits its ends have.
+        if np.isfinite(spread) and not (c.log[k] and factor * spread > np.log(AWAY)):
             inside = np.clip([c.natural_at(k, e) for e in ends], c.low[k], c.high[k])
         rows.append(Row(c.names[k], float(natural[k]), float(inside[0]), float(inside[1]), c.units[k], note))
     return Table((*rows, *noise), level)

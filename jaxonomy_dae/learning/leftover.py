@@ -1,6 +1,8 @@
 """Whether what a fit leaves over is noise: one test of one level, made of several that each look for another error.
 
-- χ² of the samples whose noise level is known: a model that misses more than the noise.
+- χ² of the samples whose noise level is known: a model that misses more than the noise; of an output, that it misses
+  less.
+- The greatest residual, and the kurtosis (`outliers`): samples that are wrong.
 - Correlations of neighbours, by the statistic of Ljung and Box (1978): noise that is correlated.
 - The highest peak of the periodogram (Fisher 1929), of one output and of all: a mode that the model lacks.
 - Power at the lowest 1, 2, 4, … frequencies (a smooth test; Neyman 1937): errors as slow as what the model describes.
@@ -19,8 +21,10 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.special import chdtrc
+from jaxtyping import Bool, Float, Int
+from scipy.special import chdtr, chdtrc
+
+from .outliers import heavy_tails, outliers
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -32,6 +36,7 @@ DRAWS = 1999
 SURE = 499  # draws after which a third of the level counts as below it: the level itself looks so once in 300 times
 BATCH = 50  # draws at once: most right models are known by the first
 ROOM = 2e7  # numbers at once: 160 MB
+BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
 FEWEST = 4  # samples of a series, below which there is nothing to correlate
 SHORTEST = 8  # frequencies of a record below which its lowest ones are those that a fit takes away
 FINE = 2  # frequencies for each that is independent: a peak between two of these loses up to three fifths of its power
@@ -64,6 +69,7 @@ class Leftover:
     - `share`: the root of each residual's weight.
     - `leverage`: L, of which L Lᵀ is what the fit takes from the noise, weights included.
     - `known`: True for samples whose noise level is known; `freedom`: of their χ².
+    - `loose`: of each output whose residuals may be too small, samples whose level is known, and degrees of freedom.
     """
 
     scores: Float[np.ndarray, " m"]
@@ -73,6 +79,7 @@ class Leftover:
     signals: tuple[Signals, ...]
     known: np.ndarray
     freedom: float
+    loose: tuple[tuple[Int[np.ndarray, " n"], float], ...] = ()
 
     @classmethod
     def of(cls, fit: "Estimate", counts: Iterable[tuple[int, int]]) -> "Leftover":
@@ -90,8 +97,13 @@ class Leftover:
             own = [one for one in series if one.output == j]
             at = np.concatenate([one.at for one in own])
             found.append(signals(at, _parts(fit, own), leverage / share[:, None]))
+        scores, loose = m.weights.scores(m.found.residual), []
+        for j in np.unique(o.rows[2][known]):
+            at = np.flatnonzero(known & (o.rows[2] == j))
+            if np.mean(scores[at] ** 2) > BELOW**2:
+                loose.append((at, max(float(np.sum(share[at] ** 2) - np.sum(leverage[at] ** 2)), 1.0)))
         return cls(
-            m.weights.scores(m.found.residual), share, leverage, series, tuple(found), known,
+            scores, share, leverage, series, tuple(found), known, loose=tuple(loose),
             freedom=max(count * fit.freedom / m.weights.samples, 1.0),
         )  # fmt: skip
 
@@ -133,6 +145,9 @@ class Leftover:
         if self.known.any():
             chi2 = np.sum((self.share * residuals)[:, self.known] ** 2, axis=1)
             found["χ²"] = chdtrc(self.freedom, chi2)
+        if self.loose:
+            sums = [np.sum((self.share * residuals)[:, at] ** 2, axis=1) for at, _ in self.loose]
+            found["small χ²"] = _any([chdtr(free, chi2) for (_, free), chi2 in zip(self.loose, sums, strict=True)])
         if not self.series:
             return found
         scaled, spectra, neighbours = np.array(residuals), [], []
@@ -142,6 +157,7 @@ class Leftover:
             own = scaled[:, one.at] = own / np.where(size > 0, size, 1.0)
             spectra.append(periodogram(own))
             neighbours.append(_neighbours(own))
+        found["outliers"] = _any([heavy_tails(scaled[:, at]) for at in self.by_output.values()])
         found["neighbours"] = _any([chdtrc(lags, statistic) for statistic, lags in neighbours])
         if len(neighbours) > 1:
             statistics, lags = zip(*neighbours, strict=True)
@@ -154,6 +170,25 @@ class Leftover:
         squares = [np.sum((scaled[:, one.at] @ one.basis) ** 2, axis=1) for one in self.signals]
         found["signals"] = chdtrc(sum(one.count for one in self.signals), np.sum(squares, axis=0))
         return found
+
+    @functools.cached_property
+    def by_output(self) -> dict[int, Int[np.ndarray, " n"]]:
+        """The samples of each output whose form is judged."""
+        outputs = dict.fromkeys(one.output for one in self.series)
+        return {j: np.concatenate([one.at for one in self.series if one.output == j]) for j in outputs}
+
+    @functools.cached_property
+    def outliers(self) -> Bool[np.ndarray, " m"]:
+        """True for single samples that lie far out, of the series whose form is judged."""
+        found = np.zeros(len(self.scores), bool)
+        for one in self.series:
+            found[one.at] = outliers(self.scores[one.at])
+        return found
+
+    @functools.cached_property
+    def without_outliers(self) -> dict[str, float]:
+        """The probability of each test if single samples that lie far out were as predicted."""
+        return {name: float(p[0]) for name, p in self.tested(np.where(self.outliers, 0.0, self.scores)[None]).items()}
 
     @functools.cached_property
     def _left(self) -> list[Float[np.ndarray, " _"]]:

@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, explained
 from .block_elimination import Blocks, eliminate, linear
 from .descent import FIRST, OFFSET, PATIENCE, SETTLED, TRIALS, Minimum, can_move, damping_after, offset
 from .evaluation import Weights
@@ -35,6 +35,7 @@ CLOSED = 0.1  # gaps that count as none, in units of the integration's relative 
 ROUNDED = 1e-12  # relative rounding errors of a segment's Jacobian, of some thousand operations
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class Shooting:
     """Multiple shooting (Bock 1981), for `Problem(method=...)`.

@@ -14,12 +14,13 @@ import scipy.special
 import scipy.stats
 from jaxtyping import Bool, Float
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, explained
 from .priors import is_finite
 
 ESTIMATE = "estimate"
 
 
+@explained
 @dataclasses.dataclass(frozen=True, eq=False)
 class Noise:
     """The noise of one signal, for `Experiment(sigma={"tank.h": Noise(...)})`.

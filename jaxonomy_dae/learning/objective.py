@@ -126,7 +126,7 @@ class Objective:
 
     @functools.cached_property
     def free(self) -> Bool[np.ndarray, " p"]:
-        """The coordinates that are searched: not frozen, and not of an experiment that does not count or has no weight."""
+        """The coordinates that are searched: not frozen, and not of experiments without weight or that do not count."""
         c = self.coordinates
         return ~c.fixed & self.owned(self.counted, shared=True) & ~self.has_no_weight
 

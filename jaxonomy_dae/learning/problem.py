@@ -11,7 +11,8 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..base.errors import ModelError, SimulationError, explained_keywords
+from ..base.errors import ModelError, SimulationError, explained_keywords, keywords_of, wrong_keyword
+from ..run.simulation.simulate import simulate
 from ..run.system.system import AcausalSystem
 from ..solve.methods.solve import check_tolerances, default_tolerances
 from .asked import METHODS, as_asked, check_start, checked_method, names_to_train, penalties, started
@@ -43,6 +44,21 @@ GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
 # Starts of a network that follow where χ² is improbable: of four fits of Stribeck's friction, two end in a local
 # minimum, so that of three starts all do in one of eight.
 AGAIN = 2
+
+
+# Options of `simulate` that a problem hands on: the others it gives itself.
+OPTIONS = tuple(
+    name for name in keywords_of(simulate)
+    if name not in ("system", "t1", "t0", "ts", "inputs", "initial", "adjoint", "throw")
+)  # fmt: skip
+ELSEWHERE = {
+    "inputs": "inputs= in each Experiment",
+    "initial": "initial= in each Experiment",
+    "sigma": "sigma= in each Experiment",
+    "noise": "sigma= in each Experiment, or method=Filter(noise)",
+    "bounds": "bounds= in fit",
+    "freeze": "freeze= in fit",
+}
 
 
 class Problem:
@@ -95,6 +111,9 @@ class Problem:
         mesh: Mesh | None = None,
         **options: Any,
     ):
+        for name in options:
+            if name not in OPTIONS:
+                raise ModelError(wrong_keyword("Problem", name, [*keywords_of(Problem.__init__), *OPTIONS], ELSEWHERE))
         if not isinstance(system, AcausalSystem):
             raise ModelError(f"Problem needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
         self.system = system

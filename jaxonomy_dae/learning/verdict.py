@@ -6,10 +6,11 @@ What a fit leaves over is judged by one test (`leftover.py`), which doubts a rig
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import chdtr
 
 from ..compile.diagnosis.wording import listed
 from .held_out import missed
-from .leftover import LEVEL, Leftover
+from .leftover import BELOW, LEVEL, Leftover
 from .objective import AWAY
 from .resolution import EXACT, NOTICED
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 SINGLE = 1e-2  # probability of a single test below which it is named, once all tests together doubt the model
 FAINT = 10.0  # times the tolerance of an integration that cannot be finer: residuals below are its error
-BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
 
 
 class FitWarning(UserWarning):
@@ -44,6 +44,11 @@ def _leftover(fit: "Estimate") -> list[str]:
         return []
     named = {name for name, p in left.found.items() if p <= max(min(left.found.values()), SINGLE)}
     said = []
+    if "outliers" in named and left.outliers.any():
+        said.append(_outliers(fit, left))
+        named = {name for name in named if left.without_outliers[name] <= SINGLE} - {"outliers"}
+    if "small χ²" in named:
+        said.extend(_overstated(fit, left))
     if "χ²" in named:
         chi2 = float(np.sum((left.share * left.scores)[left.known] ** 2))
         said.append(
@@ -58,6 +63,36 @@ def _leftover(fit: "Estimate") -> list[str]:
             "correlated: intervals are too narrow, and those of fit.table(white=False) wider. Look at "
             "fit.plot_residuals()"
         )
+    return said
+
+
+def _outliers(fit: "Estimate", left: Leftover) -> str:
+    """Single samples that lie far out: how many of each output, and the furthest."""
+    s, (experiment, row, output) = fit.objective.stacked, fit.objective.rows
+    far = np.flatnonzero(left.outliers)
+    worst = far[np.argmax(np.abs(left.scores[far]))]
+    names = [s.outputs[j] for j in dict.fromkeys(output[far].tolist())]
+    k = experiment[worst]
+    where = f"t = {s.times[k, row[worst]]:.4g}{f' of {s.labels[k]}' if len(s.labels) > 1 else ''}"
+    return (
+        f"{len(far)} of {sum(map(len, left.by_output.values()))} samples are outliers, of {listed(names, 4)}, the furthest "
+        f"at {where}: estimates and noise levels follow them. Leave them out as NaN, or take them lightly, "
+        f"sigma={{'{s.outputs[output[worst]]}': learning.Noise(student=4)}}"
+    )
+
+
+def _overstated(fit: "Estimate", left: Leftover) -> list[str]:
+    """Outputs whose noise is less than was stated."""
+    said, output = [], fit.objective.rows[2]
+    for at, freedom in left.loose:
+        chi2 = float(np.sum((left.share * left.scores)[at] ** 2))
+        if chdtr(freedom, chi2) * len(left.loose) <= SINGLE:
+            name = fit.objective.stacked.outputs[output[at[0]]]
+            said.append(
+                f"χ² of '{name}' is {chi2:.4g} where noise of the given sigma makes it {freedom:.4g} ± "
+                f"{np.sqrt(2 * freedom):.2g}: sigma is stated {np.sqrt(freedom / chi2):.2g} times too large, and "
+                f"intervals are as much too wide. Give what the sensor has, or sigma={{'{name}': 'estimate'}}"
+            )
     return said
 
 
@@ -139,8 +174,8 @@ def _table(fit: "Estimate") -> list[str]:
     away = [row.name for row in rows if row.note == "ran away"]
     if away:
         found.append(
-            f"nothing in the data keeps {listed(away, 6)} from running away, further than {AWAY:.0e} times its start: begin "
-            "closer, freeze it, or give it a prior, priors=, or bounds="
+            f"nothing in the data keeps {listed(away, 6)} from running away, further than {AWAY:.0e} times its start: "
+            "begin closer, freeze it, or give it a prior, priors=, or bounds="
         )
     if ends:
         found.append(f"a bound was reached by {listed(ends, 6)}: widen bounds=, or look whether it should be there")
