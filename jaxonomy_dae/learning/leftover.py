@@ -52,8 +52,9 @@ class Series(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """What residuals of one output may correlate with, over all experiments: `each` by name, of length one; the `basis`
-    of all; and how many of them a fit does not take up."""
+    """What residuals of one output may correlate with, over all experiments: `each` by name, of length one, and with
+    them some by which residuals are only described; the `basis` of what is tested; and how many of these a fit does not
+    take up."""
 
     at: Int[np.ndarray, " n"]
     basis: Float[np.ndarray, "n k"]
@@ -202,22 +203,6 @@ class Leftover:
         sizes = [len(one.at) for one in self.series]
         return [[k for k, n in enumerate(sizes) if n == size] for size in dict.fromkeys(sizes)]
 
-    # --- what stands out -----------------------------------------------------------------------------------------
-
-    def strongest_signal(self) -> tuple[int, str]:
-        """(the output, the name of the signal that its residuals correlate with most)."""
-        found = [(np.abs(self.scores[one.at] @ one.each), one) for one in self.signals]
-        values, one = max(found, key=lambda pair: pair[0].max())
-        output = next(s.output for s in self.series if s.at[0] in one.at)
-        return output, one.names[int(np.argmax(values))]
-
-    def slowest(self) -> int:
-        """The output with the most power at low frequencies."""
-        power = {one.output: 0.0 for one in self.series}
-        for one in self.series:
-            power[one.output] += float(np.sum(periodogram(self.scores[None, one.at])[0, : 4 * FINE]))
-        return max(power, key=lambda output: power[output])
-
 
 def periodogram(values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "s f"]:
     """The power at frequencies half as far apart as independent ones, above zero; of mean one for white noise."""
@@ -281,9 +266,14 @@ def signals(
         "the square of its rate": rate * rate, "the prediction times its rate": y * rate,
         "the square of time": tau * tau,
     }  # fmt: skip
+    tested = len(found)
+    found |= {
+        "the direction of its rate": np.sign(rate), "the sign of the prediction": np.sign(y),
+        "the rate times its size": rate * np.abs(rate),
+    }  # fmt: skip
     columns = np.stack(list(found.values()), axis=1)
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
-    basis, values, _ = np.linalg.svd(columns, full_matrices=False)
+    basis, values, _ = np.linalg.svd(columns[:, :tested], full_matrices=False)
     basis = basis[:, values > ALIKE * values[0]]
     count = max(basis.shape[1] - float(np.sum((leverage[at].T @ basis) ** 2)), 1.0)
     return Signals(at, basis, count, tuple(found), columns)

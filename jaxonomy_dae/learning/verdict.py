@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import chdtr
 
 from ..compile.diagnosis.wording import listed
+from .causes import described
 from .held_out import missed
 from .leftover import BELOW, LEVEL, Leftover
 from .objective import AWAY
@@ -51,19 +52,29 @@ def _leftover(fit: "Estimate") -> list[str]:
         said.extend(_overstated(fit, left))
     if "χ²" in named:
         chi2 = float(np.sum((left.share * left.scores)[left.known] ** 2))
+        why = (
+            "the model lacks something, or the search ended in a local minimum (starts=5)"
+            if named & COLOURS
+            else f"sigma is stated {np.sqrt(chi2 / left.freedom):.2g} times too small, or what the model lacks looks "
+            "like noise. Give what the sensor has, or sigma='estimate'"
+        )
         said.append(
             f"χ² is {chi2:.4g} where noise of the given sigma makes it {left.freedom:.4g} ± "
-            f"{np.sqrt(2 * left.freedom):.2g}: the model lacks something, the search ended in a local minimum "
-            "(starts=5), or sigma is too small"
+            f"{np.sqrt(2 * left.freedom):.2g}: {why}"
         )
-    colours = [word for tests, words in COLOURS if named & tests for word in words(fit, left)]
-    if colours:
-        said.append(
-            f"residuals are not white noise: {', '.join(colours[:4])}. The model lacks something there, or noise is "
-            "correlated: intervals are too narrow, and those of fit.table(white=False) wider. Look at "
-            "fit.plot_residuals()"
-        )
+    if named & COLOURS:
+        said.append(_coloured(fit, left))
     return said
+
+
+def _coloured(fit: "Estimate", left: Leftover) -> str:
+    """What residuals look like, and what that speaks for."""
+    best, also = described(fit, left), _standing_out(fit, left)
+    clauses = [best.clause, *(clause for clause in also if "correlate" not in best.clause)]
+    return (
+        f"residuals are not white noise: {', '.join(clauses[:4])}. It may be that {best.speaks}. Until then "
+        "intervals are too narrow, those of fit.table(white=False) wider. Look at fit.plot_residuals()"
+    )
 
 
 def _outliers(fit: "Estimate", left: Leftover) -> str:
@@ -75,8 +86,8 @@ def _outliers(fit: "Estimate", left: Leftover) -> str:
     k = experiment[worst]
     where = f"t = {s.times[k, row[worst]]:.4g}{f' of {s.labels[k]}' if len(s.labels) > 1 else ''}"
     return (
-        f"{len(far)} of {sum(map(len, left.by_output.values()))} samples are outliers, of {listed(names, 4)}, the furthest "
-        f"at {where}: estimates and noise levels follow them. Leave them out as NaN, or take them lightly, "
+        f"{len(far)} of {sum(map(len, left.by_output.values()))} samples are outliers, of {listed(names, 4)}, the "
+        f"furthest at {where}: estimates and noise levels follow them. Leave them out as NaN, or take them lightly, "
         f"sigma={{'{s.outputs[output[worst]]}': learning.Noise(student=4)}}"
     )
 
@@ -110,25 +121,7 @@ def _standing_out(fit: "Estimate", left: Leftover) -> list[str]:
     ]
 
 
-def _drifting(fit: "Estimate", left: Leftover) -> list[str]:
-    """The output that has the most power at low frequencies."""
-    name = fit.objective.stacked.outputs[left.slowest()]
-    several = len({one.output for one in left.series}) > 1
-    return [f"those of '{name}' and others drift slowly" if several else f"'{name}' drifts slowly"]
-
-
-def _following(fit: "Estimate", left: Leftover) -> list[str]:
-    """The output whose residuals follow a signal most clearly."""
-    output, signal = left.strongest_signal()
-    return [f"'{fit.objective.stacked.outputs[output]}' follows {signal}"]
-
-
-# Tests of `Leftover`, and what they say.
-COLOURS = (
-    ({"neighbours", "all neighbours", "peak", "common peak"}, _standing_out),
-    ({"slow"}, _drifting),
-    ({"signals"}, _following),
-)
+COLOURS = {"neighbours", "all neighbours", "peak", "common peak", "slow", "signals"}  # tests of form
 
 
 def _is_faint(fit: "Estimate", label: str, name: str) -> bool:
