@@ -76,7 +76,7 @@ def _descriptions(fit: "Estimate", left: Leftover, output: int) -> list[Descript
         speaks = next(text for start, text in SPEAKS.items() if label.startswith(start))
         add(f"follows {label}", float(u[own.at] @ column) ** 2, 1, speaks)
     one, two = (_correlation(u, series, lag) for lag in (1, 2))
-    if two < 0.5 * one * (1 + one):
+    if abs(two - one**2) < 0.5 * abs(one) * (1 - one):
         text = WHITE.format(name=name)
         add(f"has neighbours that correlate by {one:.2f}", one**2 * whole, 1, text)
     times = [_times(fit, one) for one in series]
@@ -96,8 +96,8 @@ def _descriptions(fit: "Estimate", left: Leftover, output: int) -> list[Descript
 
 
 def _correlation(u: Float[np.ndarray, " m"], series: Sequence[Series], lag: int) -> float:
-    """The correlation of residuals so many samples apart. That of noise of first order is ρ, ρ², …; that of a smooth
-    misfit under white noise hardly falls from the first to the second."""
+    """The correlation of residuals so many samples apart. That of noise of first order is ρ, ρ², …; that of a misfit
+    under white noise hardly falls from the first to the second, and that of a smooth one falls more and more."""
     both = sum(float(u[one.at][lag:] @ u[one.at][:-lag]) for one in series)
     return both / max(sum(float(u[one.at] @ u[one.at]) for one in series), np.finfo(float).tiny)
 

@@ -29,7 +29,7 @@ from .smoothing import followed
 from .table import Table
 from .training import Training
 from .unseen import Score, Unseen
-from .verdict import reasons
+from .verdict import asks_for_starts, reasons
 
 if TYPE_CHECKING:
     from .posterior import Posterior
@@ -45,6 +45,7 @@ class Estimate:
         weighted with `minimum.weights`.
     - `point`: the values of all coordinates at the estimate; `objective.coordinates` has their names.
     - `training`: the training before least squares, with `first=`.
+    - `tried`: the number of starting points of the search.
     """
 
     problem: "Problem"
@@ -54,6 +55,7 @@ class Estimate:
     system: AcausalSystem
     observers: dict[str, Any]
     training: Training | None = None
+    tried: int = 1
 
     @classmethod
     def of(
@@ -73,6 +75,12 @@ class Estimate:
     def reasons(self) -> tuple[str, ...]:
         """What is against this fit, each with what to try next; empty if it can be relied on."""
         return reasons(self)
+
+    @property
+    def asks_for_starts(self) -> bool:
+        """True if other starting points might lead to a better fit: the search did not end at a minimum that explains
+        the data."""
+        return asks_for_starts(self)
 
     @property
     def ok(self) -> bool:

@@ -20,6 +20,7 @@ from scipy.special import chdtrc
 from ..base.aliases import PyTree
 from ..run.system.system import AcausalSystem
 from .blocks import Block, block_of
+from .clock import Clock
 from .coordinates import Coordinates
 from .data import Stacked
 from .descent import AbstractMerit, Minimum, descend
@@ -96,6 +97,7 @@ class Objective:
     near: Float[np.ndarray, " f"] | None = dataclasses.field(default=None, kw_only=True)
     # What is told of each step: its number, the cost, χ² for each sample, and what remains.
     watch: Callable[[int, float, float, float], None] | None = dataclasses.field(default=None, kw_only=True)
+    clock: Clock | None = dataclasses.field(default=None, kw_only=True)  # what ends searches early
     # Networks with a prior of smoothness, and where they have it.
     laws: tuple[Law, ...] = dataclasses.field(default=(), kw_only=True)
     predictor: AbstractPredictor = dataclasses.field(default=Runs(), kw_only=True)
@@ -339,7 +341,7 @@ class Objective:
             return here if priors is None else here.with_priors_of(priors)
 
         reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
-        return descend(self._merit(weigh), start, self.limits, reweigh, steps, self.watch)
+        return descend(self._merit(weigh), start, self.limits, reweigh, steps, self.watch, self.clock)
 
     def _merit(self, weigh: Weigh) -> AbstractMerit:
         def finer(factor: float) -> AbstractMerit | None:
@@ -421,9 +423,8 @@ class Objective:
         fixed = np.array(c.fixed)
         fixed[: c.n_shared] = True
         c = dataclasses.replace(c, start=c.natural(full), fixed=fixed)
-        alone = dataclasses.replace(
-            self.with_noise(self.sigma(z, weights)), coordinates=c, counted=held, penalties={}, laws=(), watch=None
-        )
+        known = self.with_noise(self.sigma(z, weights))
+        alone = dataclasses.replace(known, coordinates=c, counted=held, penalties={}, laws=(), watch=None, clock=None)
         if not alone.free.any() or not len(alone.rows[0]):
             return full
         best = alone.lowest(full[alone.free])

@@ -11,12 +11,14 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..base.errors import ModelError, SimulationError, explained_keywords, keywords_of, wrong_keyword
+from ..base.errors import ModelError, SimulationError, explained_keywords, keywords_of, whole_number, wrong_keyword
 from ..run.simulation.simulate import simulate
 from ..run.system.system import AcausalSystem
 from ..solve.methods.solve import check_tolerances, default_tolerances
 from .asked import METHODS, as_asked, check_start, checked_method, names_to_train, penalties, started
+from .beginnings import GROWING as GRADUAL
 from .beginnings import beginning, silent
+from .clock import Clock
 from .coordinates import Coordinate, Coordinates, coordinates
 from .data import Data, Stacked, stack
 from .descent import OFFSET, Minimum
@@ -44,6 +46,9 @@ GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
 # Starts of a network that follow where χ² is improbable: of four fits of Stribeck's friction, two end in a local
 # minimum, so that of three starts all do in one of eight.
 AGAIN = 2
+MORE = 4  # the same of parameters alone: of 30 records of two tanks, a third ended in a local minimum
+LONG = 60.0  # seconds that a search may take, so that others follow without being asked for
+ALIKE = 1e-3  # of −ln L, by which minima count as one
 
 
 # Options of `simulate` that a problem hands on: the others it gives itself.
@@ -243,7 +248,7 @@ class Problem:
         start: "Mapping[str, float] | AcausalSystem | Training | None" = None,
         bounds: Mapping[str, tuple[float, float]] | None = None,
         first: GradientSteps | None = None,
-        starts: int = 1,
+        starts: int | None = None,
         seed: int = 0,
         adam: int = 0,
         learning_rate: float = 0.02,
@@ -251,6 +256,7 @@ class Problem:
         steps: int = 500,
         warn: bool = True,
         progress: Any = None,
+        timeout: float | None = None,
     ) -> Estimate:
         """Finds the most probable values, by least squares in units of the noise with the given priors.
 
@@ -262,10 +268,11 @@ class Problem:
             `train`.
         - `bounds`: narrower than those declared, by name.
         - `first`: steps of an Optax optimizer before least squares; `estimate.training` is their history.
-        - `starts`: the number of starting points. All but the first are drawn around it by `seed`: parameters within a
-            factor of e or their bounds, starts by their spread, networks with weights of the same sizes. The best
-            result is the one with the greatest likelihood of held-out experiments, or without any, and for a `Filter`,
-            of fitted ones.
+        - `starts`: the number of starting points; None: one, and where what it leaves over is no noise and its search
+            took less than a minute, up to four more, over growing shares of the time; of networks up to two. All but
+            the first are drawn around it by `seed`: parameters within a factor of e or their bounds, starts by their
+            spread, networks with weights of the same sizes. The best result is the one with the greatest likelihood of
+            held-out experiments, or without any, and for a `Filter`, of fitted ones.
         - `adam`: the number of gradient steps before least squares, with `learning_rate` on the scale of the
             coordinates.
         - `horizons`: shares of the record that are fitted one after the other, such as `(0.25, 0.5, 1)`, against runs
@@ -275,11 +282,12 @@ class Problem:
         - `warn`: whether a `FitWarning` gives the `reasons` if the estimate is not `ok`.
         - `progress`: True prints a line for each step: cost, χ²/n, what remains, seconds left. Or a function that is
             called with a `learning.Progress`.
+        - `timeout`: seconds, compilation included, after which no further step begins. Then, and after an interrupt
+            (Ctrl-C), the fit is that of the best point so far; its `message` says so.
 
         Without `start`, `first`, `adam` and `horizons`, networks begin at their own weights or with a last layer of
         zero, whichever is closer to the data. The weights of a raw `equinox.nn.MLP` are measured by the ranges of its
         inputs and the size of its outputs, so units do not matter. If both starts are far from the data, horizons grow.
-        If a network ends where χ² is improbable, up to two more drawn starts are tried.
         At the minimum, the error of the integration is measured. If it counts beside the noise, the search goes on with
         tighter tolerances; so it does if no step reduces the cost because of that error.
 
@@ -288,9 +296,11 @@ class Problem:
         - `ModelError` for names, values and shapes that do not fit.
         - `SimulationError` if no start can be simulated; the text gives the reason of the first.
         """
+        clock = Clock(timeout)
+        count = 1 if starts is None else whole_number(starts, "starts")
         objective = self._prepared(data, freeze, start, bounds)
-        objective = dataclasses.replace(objective, watch=reporter(progress, OFFSET))
-        if first is not None and (adam or (starts > 1 and first.checkpoint is not None)):
+        objective = dataclasses.replace(objective, watch=reporter(progress, OFFSET), clock=clock)
+        if first is not None and (adam or (count > 1 and first.checkpoint is not None)):
             other = "adam=" if adam else "a checkpoint with several starts"
             raise ModelError(f"first= does not go with {other}: leave one of them out")
         self._check_steps(adam, horizons, first)
@@ -301,38 +311,61 @@ class Problem:
         if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
         by_fit = isinstance(self.method, Filter) or not objective.stacked.holdout.any()
-        best: tuple[float, Objective, Minimum, Training | None] | None = None
         objective, own, fresh = in_ranges(
             objective, silent(objective, self._nominal(objective)), not isinstance(self.method, Shooting)
         )
-        more = AGAIN if plain and starts == 1 and not np.array_equal(silent(objective, own), own) else 0
-        points = starting_points(objective, own, fresh, starts + more, seed)
+        has_networks = not np.array_equal(silent(objective, own), own)
+        again = self._again(starts, has_networks, plain, first, adam)
+        points = starting_points(objective, own, fresh, count + again, seed)
+        best: tuple[float, Estimate] | None = None
+        tried = 0
         for k, point in enumerate(points):
-            if k >= starts and best is not None and not best[1].is_improbable(best[2]):
+            if k == count:
+                again = again and clock.elapsed < LONG
+            if best is not None and (
+                clock.is_over or (k >= count and not (again and self._asks(best[1], has_networks)))
+            ):
                 break
-            training, spans = None, shares
+            training, spans, tried = None, shares, k + 1
             if first is not None:
                 training = train(objective, point, first)
                 point = training.z
             if plain:
                 point, spans = beginning(objective, point, point if k else fresh)
+            if k >= count and not has_networks:
+                # Over a short time, runs depend on numbers almost linearly: the first start, too, may lead elsewhere.
+                point, spans = (own if k == count else point), GRADUAL if shares == (1.0,) else shares
             found = self._descend(objective, point, spans, steps, adam, learning_rate)
             if found is None:
                 continue
             here, lowest = found
             score = here.surprise(lowest) if by_fit else here.held_out(lowest.z, lowest.weights)[1]
-            if best is None or not score >= best[0]:
-                best = score, here, lowest, training
+            if best is None or score < best[0] - ALIKE:
+                best = score, self._estimate(here, lowest, training, steps)
         if best is None:
             raise SimulationError(why_not(objective))
-        _, here, lowest, training = best
-        if not isinstance(self.method, Shooting):
-            here, lowest = resolved(here, lowest, steps)
-        here = dataclasses.replace(here, watch=None)
-        fit = Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
+        fit = dataclasses.replace(best[1], tried=tried)
         if warn and fit.reasons:
             warnings.warn(f"this fit is not to be relied on: {'; '.join(fit.reasons)}", FitWarning, stacklevel=3)
         return fit
+
+    def _asks(self, fit: Estimate, has_networks: bool) -> bool:
+        """True if a fit asks for other starts."""
+        return fit.objective.is_improbable(fit.minimum) if has_networks else fit.asks_for_starts
+
+    def _again(self, starts: int | None, has_networks: bool, plain: bool, first: Any, adam: int) -> int:
+        """How many more starts may follow where the fit asks for them."""
+        if starts is not None or first is not None or adam or self.method not in METHODS:
+            return 0
+        return (AGAIN if plain else 0) if has_networks else MORE
+
+    def _estimate(self, here: Objective, lowest: Minimum, training: Training | None, steps: int) -> Estimate:
+        """The estimate at a minimum, integrated as finely as the data ask for."""
+        assert here.clock is not None
+        if not isinstance(self.method, Shooting) and not here.clock.is_over:
+            here, lowest = resolved(here, lowest, steps)
+        here = dataclasses.replace(here, watch=None, clock=None)
+        return Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
 
     def train(
         self,
@@ -404,7 +437,8 @@ class Problem:
                 here = here.at_tolerance(found.tolerance)
             if adam and share == shares[0]:
                 point = adam_steps(here, point, adam, rate)
-            found = here.lowest(point, steps)
+            # Where time is over, the whole record is only looked at.
+            found = here.lowest(point, 0 if found is not None and here.clock and here.clock.is_over else steps)
             if found is None:
                 return None
             point = found.z

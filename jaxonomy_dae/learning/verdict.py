@@ -29,31 +29,48 @@ class FitWarning(UserWarning):
 def reasons(fit: "Estimate") -> tuple[str, ...]:
     """What is against an estimate; nothing, if it is as it should be."""
     found = []
-    if not fit.minimum.converged:
-        found.append(f"{fit.message}: start elsewhere, with starts=5 or horizons=(0.1, 0.3, 1), or allow more steps=")
+    if fit.message.startswith(("interrupted", "stopped by timeout")):
+        found.append(f"{fit.message}: go on from its point, fit(start=fit.values)")
+    elif not fit.minimum.converged:
+        found.append(f"{fit.message}: start elsewhere, with starts=10 or horizons=(0.1, 0.3, 1), or allow more steps=")
     for check in (_resolution, _leftover, _held_out, _table):
         found.extend(check(fit))
     return tuple(found)
 
 
-def _leftover(fit: "Estimate") -> list[str]:
-    """What is left over, if it is not noise: all tests that say so, at least the one that says it most clearly."""
+def asks_for_starts(fit: "Estimate") -> bool:
+    """True if the search ended short of a minimum, ran away or against a bound, or left over what is no noise. Outliers
+    and noise levels that were stated too large are no reason to search elsewhere."""
+    notes = [row.note for row in fit.table()]
+    lost = any(note == "ran away" or note.startswith("bound reached") for note in notes)
+    return lost or not fit.minimum.converged or bool(_judged(fit)[1] & ({"χ²"} | COLOURS))
+
+
+def _judged(fit: "Estimate") -> tuple[Leftover, set[str]]:
+    """(what is left over, the tests that doubt it: where outliers are among them, those that do so without them)."""
     s = fit.objective.stacked
     pairs = [(label, name) for label, by in fit.residuals.items() for name in by if not _is_faint(fit, label, name)]
     left = Leftover.of(fit, [(s.labels.index(label), s.outputs.index(name)) for label, name in pairs])
     if left.probability > LEVEL:
-        return []
+        return left, set()
     named = {name for name, p in left.found.items() if p <= max(min(left.found.values()), SINGLE)}
+    if "outliers" in named and left.outliers.any():
+        named = {name for name in named if left.without_outliers[name] <= SINGLE} | {"outliers"}
+    return left, named
+
+
+def _leftover(fit: "Estimate") -> list[str]:
+    """What is left over, if it is not noise: all tests that say so, at least the one that says it most clearly."""
+    left, named = _judged(fit)
     said = []
     if "outliers" in named and left.outliers.any():
         said.append(_outliers(fit, left))
-        named = {name for name in named if left.without_outliers[name] <= SINGLE} - {"outliers"}
     if "small χ²" in named:
         said.extend(_overstated(fit, left))
     if "χ²" in named:
         chi2 = float(np.sum((left.share * left.scores)[left.known] ** 2))
         why = (
-            "the model lacks something, or the search ended in a local minimum (starts=5)"
+            f"the model lacks something{_elsewhere(fit)}"
             if named & COLOURS
             else f"sigma is stated {np.sqrt(chi2 / left.freedom):.2g} times too small, or what the model lacks looks "
             "like noise. Give what the sensor has, or sigma='estimate'"
@@ -65,6 +82,13 @@ def _leftover(fit: "Estimate") -> list[str]:
     if named & COLOURS:
         said.append(_coloured(fit, left))
     return said
+
+
+def _elsewhere(fit: "Estimate") -> str:
+    """What is to be said of local minima."""
+    if fit.tried > 1:
+        return f" ({fit.tried - 1} other starts ended no better)"
+    return ", or the search ended in a local minimum: try fit(starts=5)"
 
 
 def _coloured(fit: "Estimate", left: Leftover) -> str:
