@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.interpolate import CubicSpline
 
 from ..base.errors import ModelError, nearest
 from ..compile.lowering.plan import SystemPlan
@@ -251,8 +252,12 @@ def _inputs(
             given.append((times, values))
         m = max(len(times) for times, _ in given)
         padded = [_beyond(times, m) for times, _ in given]
-        found[name] = np.stack(padded), np.stack([_padded(values, m) for _, values in given])
-        kinds.append((name, kind or "held"))
+        kind = kind or "held"
+        found[name] = (
+            np.stack(padded),
+            np.stack([_continued(*one, at, kind) for one, at in zip(given, padded, strict=True)]),
+        )
+        kinds.append((name, kind))
     return found, tuple(kinds)
 
 
@@ -268,7 +273,7 @@ def _samples(name: str, source: object, one: Experiment, label: str) -> tuple[np
         )
     kind = source[2] if len(source) == 3 else "linear"
     if kind not in KINDS:
-        raise ModelError(f"{label}: input '{name}': samples are 'linear', 'cubic' or 'held'; got {kind!r}")
+        raise ModelError(f"{label}: input '{name}': samples are 'linear', 'spline', 'cubic' or 'held'; got {kind!r}")
     times, values = np.asarray(source[0], float), np.asarray(source[1], float)
     if times.ndim != 1 or times.shape != values.shape or len(times) < 2:
         raise ModelError(
@@ -293,6 +298,15 @@ def _beyond(times: np.ndarray, m: int) -> np.ndarray:
     """Times continued to m of them, in steps like the last."""
     step = times[-1] - times[-2]
     return np.concatenate([times, times[-1] + step * np.arange(1, m - len(times) + 1)])
+
+
+def _continued(times: np.ndarray, values: np.ndarray, longer: np.ndarray, kind: str) -> np.ndarray:
+    """Values continued to longer times: by the last one; of a spline along its last slope, so that it stays what it
+    is."""
+    if kind != "spline" or len(times) == len(longer):
+        return _padded(values, len(longer))
+    slope = CubicSpline(times, values, bc_type="natural")(times[-1], 1)
+    return np.concatenate([values, values[-1] + slope * (longer[len(times) :] - times[-1])])
 
 
 def _starts(data: Data, given: Mapping[str, Any]) -> dict[str, tuple[float | Unknown, ...]]:

@@ -56,7 +56,7 @@ class Experiment:
         arrays with one value for each sample, such as `0.01 + 0.02 * abs(y)` for partly relative errors; or
         `"estimate"`: estimated from the residuals, one for each name, the same in all experiments; or `Noise(...)`, for
         levels that are shared by sensors or proportional to a scale, and for outliers.
-    - `inputs`: by name, `(times, values)`, or with `"held"` or `"cubic"` as a third entry, or a constant.
+    - `inputs`: by name, `(times, values)`, or with `"held"`, `"spline"` or `"cubic"` as a third entry, or a constant.
     - `initial`: values at `t0` by variables' names, known (numbers) or `Unknown`. The name of a parameter gives this
         experiment a value of its own.
     - `weight`: the weight of the record.

@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from ..base.errors import ModelError, explained, nearest, whole_number
+from ..run.system.inputs import CURVED
 from ..run.system.system import AcausalSystem
 from .coordinates import Coordinate
 from .data import Stacked
@@ -138,7 +139,7 @@ def structure_and_extras(
 
     - `ModelError` for names that are not those of differential states or outputs.
     """
-    linear = is_linear(system) and "cubic" not in dict(stacked.kinds).values()
+    linear = is_linear(system) and not {*dict(stacked.kinds).values()} & {*CURVED}
     units = dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))
     if isinstance(method, Innovations):
         gains = _gains(method, system, stacked)
