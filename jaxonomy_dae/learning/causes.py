@@ -80,15 +80,16 @@ def _descriptions(fit: "Estimate", left: Leftover, output: int) -> list[Descript
         text = WHITE.format(name=name)
         add(f"has neighbours that correlate by {one:.2f}", one**2 * whole, 1, text)
     times = [_times(fit, one) for one in series]
+    for one, t in zip(series, times, strict=True):
+        if len(t) <= 2 * EDGE:
+            continue
+        explained, place = _step(u[one.at])
+        add(
+            f"steps at t = {t[place]:.4g}{_of(fit, one)}", explained, 3,
+            f"a bias stepped, or something was switched that the model does not know: cut the record there, "
+            f"Experiment.window(start, {t[place]:.4g}), or look what happened",
+        )  # fmt: skip
     if len(times[0]) > 2 * EDGE:
-        for one, t in zip(series, times, strict=True):
-            explained, place = _step(u[one.at])
-            where = f"t = {t[place]:.4g}{_of(fit, one)}"
-            add(
-                f"steps at {where}", explained, 3,
-                f"a bias stepped, or something was switched that the model does not know: cut the record there, "
-                f"Experiment.window(start, {t[place]:.4g}), or look what happened",
-            )  # fmt: skip
         found.append(_period(u, series, times, name, n, whole))
         waves = sum(float(np.sum((_half_waves(len(one.at)).T @ u[one.at]) ** 2)) for one in series)
         add("drifts slowly", waves, (1 + DRIFTS) * len(series), SLOW)

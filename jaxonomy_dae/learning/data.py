@@ -81,6 +81,7 @@ class Stacked:
     unit: Float[np.ndarray, "e n k"]  # by which a level that is estimated is multiplied
     level_of: tuple[str, ...]  # the name of each output's level: its own, or one that outputs share
     tails: Float[np.ndarray, "k 2"]  # of each output's noise: degrees of freedom, and knee
+    rho: Float[np.ndarray, " k"]  # the correlation of neighbouring errors; 0: white, NaN: to be estimated
     weight: Float[np.ndarray, " e"]
     holdout: Bool[np.ndarray, " e"]
     inputs: dict[str, tuple[Float[np.ndarray, "e m"], Float[np.ndarray, "e m"]]]
@@ -114,6 +115,7 @@ class Stacked:
     def check_plain(self, what: str) -> None:
         """Refuses noise that is not normal, or has a level that outputs share, with a `ModelError`; `what` does not
         take it."""
+        self.check_white(what)
         bent = np.flatnonzero(np.isfinite(self.tails).any(axis=1))
         shared = [name for name, level in zip(self.outputs, self.level_of, strict=True) if level != name]
         if len(bent) or shared:
@@ -121,6 +123,15 @@ class Stacked:
             kind = "has tails" if len(bent) else "shares its level"
             raise ModelError(
                 f"the noise of '{name}' {kind}, which {what} does not take: use method='single', or leave it out"
+            )
+
+    def check_white(self, what: str) -> None:
+        """Refuses noise that is correlated, with a `ModelError`; `what` does not take it."""
+        coloured = np.flatnonzero(self.rho != 0)
+        if len(coloured):
+            raise ModelError(
+                f"the noise of '{self.outputs[coloured[0]]}' is correlated, rho, which {what} does not take: use "
+                "fit() with method='single', or leave it out"
             )
 
     def until(self, share: float) -> "Stacked":
@@ -148,8 +159,10 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mappin
         outputs |= dict.fromkeys(column)
         for name, own in noise.items():
             first = noises.setdefault(name, own)
-            if (own.shared, own.tails) != (first.shared, first.tails):
-                raise ModelError(f"{label}: the noise of '{name}' has another distribution or shared level than before")
+            if (own.shared, own.tails, own.rho) != (first.shared, first.tails, first.rho):
+                raise ModelError(
+                    f"{label}: the noise of '{name}' has another distribution, correlation or shared level than before"
+                )
     n = max(len(one.times) for one in experiments)
     shape = (len(experiments), n, len(outputs))
     values, levels, unit = np.full(shape, math.nan), np.full(shape, math.nan), np.ones(shape)
@@ -177,6 +190,7 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mappin
         unit=unit,
         level_of=tuple(noises[name].shared or name for name in outputs),
         tails=np.array([noises[name].tails for name in outputs]),
+        rho=np.array([noises[name].correlation for name in outputs]),
         weight=np.array([one.weight for one in experiments], float),
         holdout=~training,
         inputs=inputs,

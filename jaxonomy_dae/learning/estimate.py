@@ -116,6 +116,12 @@ class Estimate:
         """Noise levels that were estimated, by name."""
         return self.objective.sigma(self.minimum.z, self.minimum.weights)
 
+    @property
+    def rho(self) -> dict[str, float]:
+        """Correlations of errors one sampling step apart that were estimated, by name."""
+        s = self.objective.stacked
+        return {name: float(self.objective.rho[j]) for j, name in enumerate(s.outputs) if np.isnan(s.rho[j])}
+
     # --- uncertainty -------------------------------------------------------------------------------------------
 
     @functools.cached_property
@@ -165,7 +171,8 @@ class Estimate:
     @property
     def residuals(self) -> dict[str, dict[str, np.ndarray]]:
         """Predictions less data of the experiments that were fitted, by experiment and name, in units of the noise: a
-        number for each row of the record, NaN where nothing was measured."""
+        number for each row of the record, NaN where nothing was measured. Where noise is correlated, `rho`, they are
+        what the sample before leaves open, so that they are independent."""
         return self._by_record(self.minimum.weights.scale * self.minimum.found.residual)
 
     def _by_record(self, values: Float[np.ndarray, " m"]) -> dict[str, dict[str, np.ndarray]]:
@@ -412,7 +419,7 @@ class Estimate:
     def log_likelihood(self) -> float:
         """ln L of the fitted samples, without priors. Prefer the model with the smallest 2p − 2 ln L (Akaike) or p ln n
         − 2 ln L (Schwarz), for p coordinates and n samples."""
-        return log_likelihood(self.minimum)
+        return log_likelihood(self.objective, self.minimum)
 
     @explained_keywords()
     def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:

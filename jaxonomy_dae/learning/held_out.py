@@ -14,6 +14,7 @@ import scipy.stats
 from jaxtyping import Float
 from scipy.special import chdtrc
 
+from .colour import Colour
 from .noise import Tails
 from .objective import Objective
 
@@ -44,7 +45,10 @@ def missed(
         only = np.arange(len(s.labels)) == k
         rows = np.nonzero(s.observed & only[:, None, None])
         u, level = objective.standardized(point, sigma, rows)
-        by_all = c.pulled(point, predicted.jacobian(rows)) / level[:, None]
+        by_all = c.pulled(point, predicted.jacobian(rows))
+        if objective.rho.any():
+            by_all = Colour.of(s, rows, objective.rho).whitened(by_all)
+        by_all = by_all / level[:, None]
         if not (np.isfinite(u).all() and np.isfinite(by_all).all()):
             found[s.labels[k]] = np.inf, 1.0
             continue

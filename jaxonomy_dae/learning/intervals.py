@@ -125,7 +125,17 @@ def noise_intervals(objective: Objective, minimum: Minimum, root: Float[np.ndarr
     for k, name in enumerate(evidence.labels):
         own = evidence.noise == k
         freedom = max(float(np.sum(weights.share[own] ** 2) - np.sum(taken[own])), 1.0)
+        # ln σ² of errors of first order has a variance (1 + ρ²)/(1 − ρ²) times that of independent ones.
+        squares = np.mean(objective.rho[objective.rows[2][own]] ** 2)
+        freedom = max(freedom * (1 - squares) / (1 + squares), 1.0)
         value = float(1 / (weights.scale * evidence.unit)[own][0])
         low, high = (value * np.sqrt(freedom / scipy.stats.chi2.ppf(0.5 + s * level / 2, freedom)) for s in (1, -1))
         rows.append(Row(f"sigma of {name}", value, float(low), float(high), units.get(name, ""), ""))
+    for j in np.flatnonzero(np.isnan(objective.stacked.rho)):
+        own, rho = objective.rows[2] == j, float(objective.rho[j])
+        # The variance of ρ is (1 − ρ²)/n, and that of artanh ρ, which is more nearly normal, 1/(n (1 − ρ²)).
+        freedom = max(float(np.sum(weights.share[own] ** 2) - np.sum(taken[own])), 1.0)
+        wide = scipy.stats.norm.ppf(0.5 + level / 2) / np.sqrt(freedom * (1 - rho**2))
+        low, high = np.tanh(np.arctanh(rho) - wide), np.tanh(np.arctanh(rho) + wide)
+        rows.append(Row(f"rho of {objective.stacked.outputs[j]}", rho, float(low), float(high), "", ""))
     return rows

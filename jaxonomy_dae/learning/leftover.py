@@ -80,7 +80,7 @@ class Leftover:
     signals: tuple[Signals, ...]
     known: np.ndarray
     freedom: float
-    loose: tuple[tuple[Int[np.ndarray, " n"], float], ...] = ()
+    loose: tuple[tuple[Int[np.ndarray, " _"], float], ...] = ()
 
     @classmethod
     def of(cls, fit: "Estimate", counts: Iterable[tuple[int, int]]) -> "Leftover":
@@ -173,7 +173,7 @@ class Leftover:
         return found
 
     @functools.cached_property
-    def by_output(self) -> dict[int, Int[np.ndarray, " n"]]:
+    def by_output(self) -> dict[int, Int[np.ndarray, " _"]]:
         """The samples of each output whose form is judged."""
         outputs = dict.fromkeys(one.output for one in self.series)
         return {j: np.concatenate([one.at for one in self.series if one.output == j]) for j in outputs}
@@ -282,9 +282,10 @@ def signals(
 def _parts(fit: "Estimate", series: list[Series]) -> list[tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]]:
     """(predictions, times, inputs) of some series."""
     s, rows, parts = fit.objective.stacked, fit.objective.rows[1], []
+    errors = fit.objective.colour.coloured(fit.minimum.found.residual)
     for one in series:
         k, i = one.experiment, rows[one.at]
         t = s.times[k, i]
         inputs = {name: np.interp(t, times[k], values[k]) for name, (times, values) in s.inputs.items()}
-        parts.append((fit.minimum.found.residual[one.at] + s.values[k, i, one.output], t, inputs))
+        parts.append((errors[one.at] + s.values[k, i, one.output], t, inputs))
     return parts

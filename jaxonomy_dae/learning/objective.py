@@ -21,6 +21,7 @@ from ..base.aliases import PyTree
 from ..run.system.system import AcausalSystem
 from .blocks import Block, block_of
 from .clock import Clock
+from .colour import Colour
 from .coordinates import Coordinates
 from .data import Stacked
 from .descent import AbstractMerit, Minimum, descend
@@ -101,6 +102,27 @@ class Objective:
     # Networks with a prior of smoothness, and where they have it.
     laws: tuple[Law, ...] = dataclasses.field(default=(), kw_only=True)
     predictor: AbstractPredictor = dataclasses.field(default=Runs(), kw_only=True)
+    # The correlation of neighbouring errors of each output; None: as the data say, and where it is unknown, zero.
+    correlations: Float[np.ndarray, " k"] | None = dataclasses.field(default=None, kw_only=True)
+
+    @property
+    def rho(self) -> Float[np.ndarray, " k"]:
+        """The correlation of neighbouring errors of each output."""
+        return np.nan_to_num(self.stacked.rho) if self.correlations is None else self.correlations
+
+    def with_rho(self: Same, rho: Float[np.ndarray, " k"]) -> Same:
+        """A copy with these correlations of neighbouring errors."""
+        return dataclasses.replace(self, correlations=rho)
+
+    @property
+    def white(self: Same) -> Same:
+        """A copy whose errors are independent."""
+        return self.with_rho(np.zeros(len(self.rho)))
+
+    @functools.cached_property
+    def colour(self) -> Colour:
+        """The filter that makes errors of the samples that count independent."""
+        return Colour.of(self.stacked, self.rows, self.rho)
 
     @property
     def has_variances(self) -> bool:
@@ -259,7 +281,7 @@ class Objective:
 
     def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
         """Residuals and Jacobian of the free coordinates, with their variances if the predictor says them; None where a
-        run that counts fails."""
+        run that counts fails. Where errors are correlated, residuals are their innovations."""
         full = self.full(z)
         found, variance = self._differentiated(full, self.counted)
         c = self.coordinates
@@ -272,11 +294,15 @@ class Objective:
                 s = variance.outputs[self.rows]
                 slope = c.pulled(full, variance.jacobian(self.rows) / s[:, None])
                 parts += [np.where(s > 0, s, np.nan), slope[:, self.free]]
+            elif self.rho.any():
+                parts = [self.colour.whitened(part) for part in parts]
         return Evaluation(*parts) if all(np.isfinite(a).all() for a in parts) else None
 
     def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
         """Residuals alone; None where a run that counts fails."""
         found = self.outputs(self.full(z))[self.rows] - self.stacked.values[self.rows]
+        if self.rho.any():
+            found = self.colour.whitened(found)
         return found if np.isfinite(found).all() else None
 
     def _runs(self, full: Float[np.ndarray, " p"]) -> Float[np.ndarray, "e n _"]:
@@ -396,12 +422,12 @@ class Objective:
         for group in self.evidence.groups:
             given[group] = 0.0
         weights = dataclasses.replace(found.weights, precision=given, bends=None)
-        return weights.cost(found.z, found.found.residual) - weights.log_rows
+        return weights.cost(found.z, found.found.residual) - weights.log_rows + self.colour.log_scale(weights.share)
 
     def standardized(
         self, full: Float[np.ndarray, " p"], sigma: dict[str, float], rows: tuple[np.ndarray, ...]
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """(residuals of chosen samples in units of the noise, these units)."""
+        """(residuals of chosen samples in units of the noise, or of correlated noise, their innovations; the units)."""
         s, variance = self.with_noise(sigma).stacked, None
         if self.has_variances:
             found, variance = self._differentiated(full, np.ones(len(self.counted), bool))
@@ -410,7 +436,10 @@ class Objective:
             outputs = self.outputs(full)
         with np.errstate(invalid="ignore"):
             level = np.where(np.isnan(s.sigma), s.unit, s.sigma) if variance is None else np.sqrt(variance.outputs)
-        return (outputs[rows] - s.values[rows]) / level[rows], level[rows]
+            errors = outputs[rows] - s.values[rows]
+            if self.rho.any():
+                errors = Colour.of(s, rows, self.rho).whitened(errors)
+        return errors / level[rows], level[rows]
 
     # --- experiments that are held out ---------------------------------------------------------------------------
 
@@ -442,7 +471,8 @@ class Objective:
         if not np.isfinite(u).all():
             return np.inf, np.inf
         count, surprise = self.stacked.weight[rows[0]], self.surprises(u, rows[2]) + np.log(level)
-        return float(np.sqrt(np.average(u**2, weights=count))), float(np.sum(count * surprise))
+        scale = Colour.of(self.stacked, rows, self.rho).log_scale(np.sqrt(count))
+        return float(np.sqrt(np.average(u**2, weights=count))), float(np.sum(count * surprise)) + scale
 
     def surprises(self, u: Float[np.ndarray, " m"], output: Int[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """−ln of the density of residuals in units of the noise, times √(2π)."""

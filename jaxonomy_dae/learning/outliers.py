@@ -15,7 +15,7 @@ def heavy_tails(u: Float[np.ndarray, "s n"]) -> Float[np.ndarray, " s"]:
     which several of them do not mask."""
     n = u.shape[1]
     squares = u**2
-    total = np.maximum(np.sum(squares, axis=1), np.finfo(float).tiny)
+    total = np.maximum(np.sum(squares, axis=1), np.sqrt(np.finfo(float).tiny))
     greatest = n * betaincc(0.5, 0.5 * (n - 1), np.max(squares, axis=1) / total)
     if n < FEWEST:
         return np.minimum(greatest, 1.0)

@@ -19,6 +19,7 @@ from .asked import METHODS, as_asked, check_start, checked_method, names_to_trai
 from .beginnings import GROWING as GRADUAL
 from .beginnings import beginning, silent
 from .clock import Clock
+from .colour_search import correlated
 from .coordinates import Coordinate, Coordinates, coordinates
 from .data import Data, Stacked, stack
 from .descent import OFFSET, Minimum
@@ -328,6 +329,7 @@ class Problem:
                 break
             training, spans, tried = None, shares, k + 1
             if first is not None:
+                objective.stacked.check_white("first=")
                 training = train(objective, point, first)
                 point = training.z
             if plain:
@@ -384,6 +386,7 @@ class Problem:
         if not isinstance(how, GradientSteps):
             raise ModelError(f"train takes learning.GradientSteps(optax.adam(0.02), steps=200); got {how!r}")
         self._check_steps(0, None, how)
+        (self._stacked if data is None else self.stacked(data)).check_white("train")
         objective = self._prepared(data, freeze, start, bounds)
         return train(objective, objective.coordinates.z_start[objective.free], how)
 
@@ -443,6 +446,7 @@ class Problem:
                 return None
             point = found.z
         assert found is not None
+        objective, found = correlated(objective, found, steps)
         return smoother(objective, found, steps) or (objective, found)
 
     def reach(self, objective: Objective, start: np.ndarray, weights: Weights) -> Minimum | None:

@@ -57,7 +57,7 @@ class Unseen:
         if first is not None and (isinstance(first, bool) or not isinstance(first, int) or first < 1):
             raise ModelError(f"first is a number of rows ≥ 1, or None for all; got {first!r}")
         problem, fitted = estimate.problem, estimate.objective
-        stacked = with_noise_of(fitted.stacked, problem.stacked(Data(experiment.changed(holdout=False, weight=1.0))))
+        stacked = with_noise_of(fitted, problem.stacked(Data(experiment.changed(holdout=False, weight=1.0))))
         c = problem.coordinates_of(fitted.setting._replace(layout=problem.layout_of(stacked)), stacked)
         known = estimate.values
         shared = [k for k in range(c.n_shared) if c.names[k] in known]
@@ -109,33 +109,39 @@ class Unseen:
         check_noise(o)
         s, rows = o.stacked, o.rows
         u, level = o.standardized(self.point, {}, rows)
-        errors = u * level
+        errors = o.outputs(self.point)[rows] - s.values[rows]
         rms = {
             name: float(np.sqrt(np.mean(errors[rows[2] == j] ** 2)))
             for j, name in enumerate(s.outputs)
             if (rows[2] == j).any()
         }
         likelihood = -float(np.sum(o.surprises(u, rows[2]) + np.log(level) + 0.5 * np.log(2 * np.pi)))
+        likelihood -= o.colour.log_scale(np.ones(len(u)))
         return Score(rms, float(np.sqrt(np.mean(u**2))), likelihood)
 
 
-def with_noise_of(fitted: Stacked, new: Stacked) -> Stacked:
+def with_noise_of(fit: Objective, new: Stacked) -> Stacked:
     """New data, in which outputs whose experiment says nothing of their noise have that of the fit: its level, its
-    distribution, or the name of the level that was estimated. Levels that the fit has for each sample go with its
-    samples, and stay NaN."""
-    sigma, level_of, tails = np.array(new.sigma), list(new.level_of), np.array(new.tails)
+    distribution and correlation, or the name of the level that was estimated. Levels that the fit has for each sample
+    go with its samples, and stay NaN."""
+    fitted = fit.stacked
+    sigma, level_of, tails, rho = np.array(new.sigma), list(new.level_of), np.array(new.tails), np.array(new.rho)
     for j, name in enumerate(new.outputs):
-        is_silent = np.isnan(new.sigma[..., j]).all() and new.level_of[j] == name and np.isinf(new.tails[j]).all()
-        if not is_silent or np.any(new.unit[..., j] != 1) or name not in fitted.outputs:
+        if name not in fitted.outputs:
             continue
         k = fitted.outputs.index(name)
+        is_bare = new.level_of[j] == name and np.isinf(new.tails[j]).all() and np.all(new.unit[..., j] == 1)
+        is_silent = is_bare and np.isnan(new.sigma[..., j]).all()
+        rho[j] = fit.rho[k] if np.isnan(rho[j]) or (is_silent and rho[j] == 0) else rho[j]
+        if not is_silent:
+            continue
         seen = fitted.observed[..., k]
         levels, units = np.unique(fitted.sigma[..., k][seen]), np.unique(fitted.unit[..., k][seen])
         if len(levels) == 1 and units.tolist() == [1.0]:
             sigma[..., j], level_of[j], tails[j] = levels[0], fitted.level_of[k], fitted.tails[k]
         else:
             level_of[j] = ""
-    return dataclasses.replace(new, sigma=sigma, level_of=tuple(level_of), tails=tails)
+    return dataclasses.replace(new, sigma=sigma, level_of=tuple(level_of), tails=tails, rho=np.nan_to_num(rho))
 
 
 def check_noise(objective: Objective) -> None:

@@ -110,7 +110,8 @@ def simulate(
         `atol` is multiplied by the nominal values of the states. A state without a nominal value has the size that
         follows from starts and equations, if that is below one.
     - `inputs`: by the inputs' names: constants; samples `(times, values)`, interpolated linearly, or with `"spline"`,
-        `"cubic"` or `"held"` as a third entry; `diffrax.LinearInterpolation` and `diffrax.CubicInterpolation`; functions of time.
+        `"cubic"` or `"held"` as a third entry; `diffrax.LinearInterpolation` and `diffrax.CubicInterpolation`;
+        functions of time.
         Steps end at the times of samples. A function reads variables of its surroundings when `simulate` is called.
     - `initial`: values at `t0` by variables' names. They replace the starts declared in components. Or the whole state
         of another run, `solution.at(k)`: this run continues from it, with its discrete variables, modes and clocks, and
