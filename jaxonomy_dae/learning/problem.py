@@ -48,6 +48,7 @@ GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
 # minimum, so that of three starts all do in one of eight.
 AGAIN = 2
 MORE = 4  # the same of parameters alone: of 30 records of two tanks, a third ended in a local minimum
+ENOUGH = 100  # evaluations of these, unless the search before took more: they cost no more than it did
 LONG = 60.0  # seconds that a search may take, so that others follow without being asked for
 ALIKE = 1e-3  # of −ln L, by which minima count as one
 
@@ -319,12 +320,14 @@ class Problem:
         again = self._again(starts, has_networks, plain, first, adam)
         points = starting_points(objective, own, fresh, count + again, seed)
         best: tuple[float, Estimate] | None = None
-        tried = 0
+        tried, spent, most = 0, 0, np.inf  # evaluations, and how many more may follow
         for k, point in enumerate(points):
             if k == count:
                 again = again and clock.elapsed < LONG
+                most = np.inf if has_networks else spent + max(spent, ENOUGH)
+            is_enough = k >= count and not (again and spent < most)
             if best is not None and (
-                clock.is_over or (k >= count and not (again and self._asks(best[1], has_networks)))
+                clock.is_over or is_enough or (k >= count and not self._asks(best[1], has_networks))
             ):
                 break
             training, spans, tried = None, shares, k + 1
@@ -337,10 +340,11 @@ class Problem:
             if k >= count and not has_networks:
                 # Over a short time, runs depend on numbers almost linearly: the first start, too, may lead elsewhere.
                 point, spans = (own if k == count else point), GRADUAL if shares == (1.0,) else shares
-            found = self._descend(objective, point, spans, steps, adam, learning_rate)
+            found = self._descend(objective, point, spans, int(min(steps, most - spent)), adam, learning_rate)
             if found is None:
                 continue
             here, lowest = found
+            spent += lowest.evaluations
             score = here.surprise(lowest) if by_fit else here.held_out(lowest.z, lowest.weights)[1]
             if best is None or score < best[0] - ALIKE:
                 best = score, self._estimate(here, lowest, training, steps)
@@ -433,7 +437,7 @@ class Problem:
         if isinstance(self.method, Shooting):
             found = shoot(objective, self.method, point, steps, self._options["rtol"])
             return None if found is None else (objective, found)
-        found = None
+        found, evaluations = None, 0
         for share in shares:
             here = objective.until(share, silent(objective, point))
             if found is not None:
@@ -444,9 +448,9 @@ class Problem:
             found = here.lowest(point, 0 if found is not None and here.clock and here.clock.is_over else steps)
             if found is None:
                 return None
-            point = found.z
+            point, evaluations = found.z, evaluations + found.evaluations
         assert found is not None
-        objective, found = correlated(objective, found, steps)
+        objective, found = correlated(objective, dataclasses.replace(found, evaluations=evaluations), steps)
         return smoother(objective, found, steps) or (objective, found)
 
     def reach(self, objective: Objective, start: np.ndarray, weights: Weights) -> Minimum | None:

@@ -26,7 +26,8 @@ ROUNDS = 4  # from 1e-6 to rounding
 def resolved(objective: Objective, found: Minimum, steps: int) -> tuple[Objective, Minimum]:
     """(the objective with the tolerance that the data ask for, its minimum with its `resolution`), from a minimum."""
     here = objective.at_tolerance(found.tolerance)
-    for _ in range(ROUNDS):
+    # Where a search got stuck, the error says nothing about the minimum.
+    for _ in range(ROUNDS if found.converged else 0):
         error = integration_error(here, found)
         if error is None:
             break
