@@ -23,12 +23,12 @@ def double_pendulum(mode):
 
 
 @functools.cache
-def four_bar():
+def four_bar(coupler_at=0.3, rocker_at=1.7):
     """A crank that turns fully, its coupler and a rocker, all uniform rods; guesses choose the open position."""
     b = Bench()
     west, east = b(pl.World, "west"), b(pl.World, "east", 2.0)
-    crank, coupler = b(pl.MassiveLink, "crank", 0.8), b(pl.MassiveLink, "coupler", 1.9, m=0.6, guess_angle=0.3)
-    rocker = b(pl.MassiveLink, "rocker", 1.5, m=1.5, guess_angle=1.7)
+    crank, coupler = b(pl.MassiveLink, "crank", 0.8), b(pl.MassiveLink, "coupler", 1.9, m=0.6, guess_angle=coupler_at)
+    rocker = b(pl.MassiveLink, "rocker", 1.5, m=1.5, guess_angle=rocker_at)
     pins = [b(pl.Revolute, "j1", initial_angle=1.0, initial_speed=5.0), *(b(pl.Revolute, f"j{k}") for k in (2, 3, 4))]
     b.chain(west.frame, pins[0].frame_a, pins[0].frame_b, crank.frame_a, crank.frame_b, pins[1].frame_a,
             pins[1].frame_b, coupler.frame_a, coupler.frame_b, pins[2].frame_a, pins[2].frame_b, rocker.frame_b,

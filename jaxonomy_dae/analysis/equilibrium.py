@@ -99,8 +99,8 @@ class _Rows:
         x, q = self.parts(w, base)
         here = system.holding(q).at(t, inputs)
         slopes = here.semi_explicit(x)
-        creeping = jnp.abs(slopes) <= self.slowest
-        slopes = slopes - jax.lax.stop_gradient(jnp.where(creeping, slopes, 0))
+        now = jax.lax.stop_gradient(slopes)
+        slopes = slopes - jnp.where(jnp.abs(now) <= self.slowest, now, 0)  # what creeps is at rest
         rows = [slopes[self.free], here.projected_onto(x)]
         if self.events is not None and len(self.events.ticking):
             rows.append(left_by_ticks(system, t, inputs, self.events, x, q))

@@ -167,7 +167,7 @@ def _coordinates(system: AcausalSystem, partials: Partials, wanted: Sequence[str
     rows = np.arange(c) if chosen is None else chosen.rows
     if len(set(kept)) != n - len(rows):
         raise ModelError(f"states: {n - len(rows)} coordinates are needed, of {system.states}; got {list(wanted)}")
-    if scaled is not None and len(choose_coordinates(scaled[rows][:, dependent]).dependent) < len(rows):
+    if scaled is not None and len(choose_coordinates(scaled[rows], dependent).dependent) < len(rows):
         raise ModelError(
             f"states: {list(wanted)} do not determine the other states at this point; "
             f"{[system.states[k] for k in chosen.kept]} do"  # pyright: ignore[reportOptionalMemberAccess]

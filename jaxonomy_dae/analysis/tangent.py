@@ -23,12 +23,15 @@ class Coordinates(NamedTuple):
     rows: np.ndarray
 
 
-def choose_coordinates(jacobian: Float[np.ndarray, "c n"]) -> Coordinates:
+def choose_coordinates(jacobian: Float[np.ndarray, "c n"], give_way: np.ndarray | None = None) -> Coordinates:
     """Gaussian elimination with complete pivoting, each constraint in units of its gradient. Of pivots that are alike
-    the last state gives way, so that positions and velocities are chosen alike."""
+    the last state gives way, so that positions and velocities are chosen alike. With `give_way`, only these states
+    may."""
     c, n = jacobian.shape
     norm = np.linalg.norm(jacobian, axis=1, keepdims=True)
     left = jacobian / np.where(norm > 0, norm, 1)
+    if give_way is not None:
+        left[:, np.setdiff1d(np.arange(n), give_way)] = 0.0
     rows, columns = [], []
     for _ in range(min(c, n)):
         size = np.abs(left)

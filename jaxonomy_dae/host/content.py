@@ -15,6 +15,7 @@ import dis
 import enum
 import functools
 import hashlib
+import struct
 import sys
 import types
 import weakref
@@ -182,12 +183,15 @@ class _Walk:
     def _set(self, part: Any, kind: type) -> None:
         """Members have no order of their own, so that each is walked over by itself. One that leads back to the set
         would never end: only plain data, and what is known by its name, count."""
+        self._name_of_class(kind)
+        if kind not in (set, frozenset):
+            self._attributes(part, kind)
         members = []
         for member in part:
             if not _is_plain(member):
                 return self.hidden(f"a set with an object of type {type(member).__qualname__}")
             members.append(content(member).digest)
-        self.say("set", kind.__name__, *sorted(members))
+        self.say("set", *sorted(members))
 
     def _tree(self, tree: Any) -> None:
         """The structure of a pytree. Of one that consists of the package's records and of containers, and in which no
@@ -337,7 +341,8 @@ class _Walk:
         # Classes with a way of their own to be written to files say with it what they consist of. Those of the package
         # leave out what a file cannot hold.
         own_way = kind.__reduce_ex__ is not object.__reduce_ex__ or kind.__reduce__ is not object.__reduce__
-        if own_way and not kind.__module__.startswith(f"{libraries.PACKAGE}.") or not self._attributes(part, kind):
+        all_seen = _has_only_attributes(kind) and (not own_way or kind.__module__.startswith(_OWN))
+        if not (all_seen and self._attributes(part, kind)):
             try:
                 found = part.__reduce_ex__(4)
             except Exception:  # whatever classes of others raise
@@ -359,6 +364,25 @@ class _Walk:
                 self.part(given[name])
         return True
 
+
+@functools.lru_cache(maxsize=4096)
+def _has_only_attributes(kind: type) -> bool:
+    """True if instances hold nothing but attributes. Beside them, one of a subclass of float holds its number, and one
+    of a class written in C whatever it likes: their memory is larger than their slots need."""
+    while kind is not object:
+        base = kind.__base__
+        if base is None or not kind.__flags__ & _MADE_AT_RUN_TIME:
+            return False
+        slots = [name for name in _slots(kind) if name not in ("__dict__", "__weakref__")]
+        extra = [kind.__dictoffset__ > base.__dictoffset__ >= 0, kind.__weakrefoffset__ > base.__weakrefoffset__ >= 0]
+        if kind.__basicsize__ - base.__basicsize__ > _WORD * (len(slots) + sum(extra)):
+            return False
+        kind = base
+    return True
+
+
+_MADE_AT_RUN_TIME = 1 << 9  # Py_TPFLAGS_HEAPTYPE of `object.h`: what a class statement makes has it
+_WORD = struct.calcsize("P")
 
 _BUILT_IN = frozenset({type(None), tuple, list, dict, set, frozenset, bool, int, float, complex, str, bytes})
 

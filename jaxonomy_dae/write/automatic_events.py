@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import sympy
+from sympy.functions.elementary.piecewise import ExprCondPair
 
 from ..base.aliases import Condition, Expression
 from ..base.errors import ModelError
@@ -193,13 +194,14 @@ class _Rewriting:
         if not e.args or isinstance(e, Smooth):
             return e
         inside = [self.new[a] for a in e.args]
-        if _has_an_end(e):
+        if _has_an_end(e) and not e.args[0].is_number:
             inside[0] = self._within_domain(e, inside[0])
         if isinstance(e, KINKED) and e in self.varying:
             return _FORMS[type(e)](functools.partial(self._turns, [e]), functools.partial(self._stepping, e), *inside)
         if all(new is old for new, old in zip(inside, e.args, strict=True)):
             return e
-        return e.func(*inside)
+        # SymPy draws a power of branches into them.
+        return e.func(*inside, **({"evaluate": False} if inside[0].has(sympy.Piecewise) and e.is_Pow else {}))
 
     def _piecewise(self, e: Expression) -> Expression:
         pairs = []
@@ -213,7 +215,7 @@ class _Rewriting:
             else:
                 self.places[condition].append(e)
             pairs.append((self.new[branch], self.conditions[condition]))
-        return sympy.Piecewise(*pairs, evaluate=False)
+        return by_conditions(*pairs)
 
     def _within_domain(self, e: Expression, argument: Expression) -> Expression:
         """The argument of a root or the like where a branch is kept beyond its end, and the function may have no value:
@@ -227,10 +229,10 @@ class _Rewriting:
         back: Expression = argument
         if high is not None:
             outside = sympy.Or(outside, sympy.Gt(live, high))
-            back = sympy.Piecewise((back, sympy.Le(argument, high, evaluate=False)), (high, True), evaluate=False)
-        back = sympy.Piecewise((back, sympy.Ge(argument, low, evaluate=False)), (mirrored, True), evaluate=False)
+            back = by_conditions((back, sympy.Le(argument, high, evaluate=False)), (high, True))
+        back = by_conditions((back, sympy.Ge(argument, low, evaluate=False)), (mirrored, True))
         written_so = sympy.And(_holding(self.needed[e], lambda c: c), outside)
-        return back if written_so is sympy.false else sympy.Piecewise((live, written_so), (back, True), evaluate=False)
+        return back if written_so is sympy.false else by_conditions((live, written_so), (back, True))
 
     def _turns(self, places: list[Expression], relation: Condition) -> Condition:
         """`_turning` for a relation whose sides are in their new forms."""
@@ -276,7 +278,7 @@ class _Rewriting:
         else:
             self.timed_steps.append(Stepping(number, argument, edges))
         unknown: Condition = sympy.Eq(live, LIVE)
-        return sympy.Piecewise((sympy.floor(argument), unknown), (whole, True), evaluate=False)
+        return by_conditions((sympy.floor(argument), unknown), (whole, True))
 
 
 def _holding(needed: Needed, form: Callable[[Expression], Expression]) -> Condition:
@@ -301,6 +303,20 @@ def _has_an_end(e: Expression) -> bool:
 Turn = Callable[[Any], Any]
 
 
+def by_conditions(*pairs: tuple[Any, Any]) -> Expression:
+    """A `Piecewise` with the pairs as they are, up to the first condition that always holds. SymPy multiplies out
+    branches that stand in conditions of others, exponentially many, even if it is not to evaluate anything."""
+    kept = []
+    for value, condition in pairs:
+        if condition != sympy.false:
+            kept.append(sympy.Tuple.__new__(ExprCondPair, sympy.sympify(value), sympy.sympify(condition)))
+        if condition == sympy.true:
+            break
+    if len(kept) == 1 and kept[0].cond == sympy.true:
+        return kept[0].expr
+    return sympy.Basic.__new__(sympy.Piecewise, *kept)
+
+
 def _larger(turn: Turn, _: Turn, *arguments: Expression) -> Expression:
     return functools.reduce(lambda a, b: _chosen(turn, a, b, sympy.Ge), arguments)
 
@@ -313,17 +329,17 @@ def _chosen(turn: Turn, a: Expression, b: Expression, relation: Callable[..., Co
     if a.is_number:
         a, b = b, a
     condition = relation(a, b, evaluate=False)
-    return sympy.Piecewise((a, turn(condition) if varies(condition) else condition), (b, True), evaluate=False)
+    return by_conditions((a, turn(condition) if varies(condition) else condition), (b, True))
 
 
 def _absolute(turn: Turn, _: Turn, u: Expression) -> Expression:
-    return sympy.Piecewise((u, turn(sympy.Ge(u, 0, evaluate=False))), (-u, True), evaluate=False)
+    return by_conditions((u, turn(sympy.Ge(u, 0, evaluate=False))), (-u, True))
 
 
 def _by_sign(turn: Turn, u: Expression, above: Expression, at_zero: Expression, below: Expression) -> Expression:
     """Branches for u > 0, u = 0 and u < 0: at zero a solution may stay."""
     positive, negative = (turn(relation(u, 0, evaluate=False)) for relation in (sympy.Gt, sympy.Lt))
-    return sympy.Piecewise((above, positive), (below, negative), (at_zero, True), evaluate=False)
+    return by_conditions((above, positive), (below, negative), (at_zero, True))
 
 
 def _sign(turn: Turn, _: Turn, u: Expression) -> Expression:

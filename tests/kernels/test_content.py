@@ -23,6 +23,7 @@ from jaxonomy_dae.host.cache import ProgramCache
 from jaxonomy_dae.host.compilations import compilations
 from jaxonomy_dae.host.content import content
 from jaxonomy_dae.host.program import types_of
+from jaxonomy_dae.run.system.closed_function import closed_function
 
 
 class Noted(list):
@@ -174,7 +175,29 @@ def local(rate, power=1):
     return Slow(rate)
 
 
+class Metres(float):
+    pass
+
+
+class Marked(set):
+    mark = 0
+
+
+def marked(mark):
+    some = Marked()
+    some.mark = mark
+    return some
+
+
+def branching(number):
+    """A number in a branch is part of the program: JAX wraps it in a subclass of float."""
+    return closed_function(lambda t: jax.lax.cond(t > 0, lambda: number, lambda: 0.0), np.float64)
+
+
 DIFFERENT = {
+    "numbers of a subclass": (Metres(1.0), Metres(2.0)),
+    "sets with attributes": (marked(1), marked(2)),
+    "numbers in branches": tuple(jax.tree.structure(branching(number)) for number in (1.0, 2.0)),
     "solvers of one name": (diffrax.Tsit5(), solvers.Tsit5()),
     "solvers": (solvers.BDF(), solvers.Rodas5P()),
     "an option": (solvers.BDF(), dataclasses.replace(solvers.BDF(), max_order=2)),

@@ -50,7 +50,7 @@ class Stop(AbstractHybridProblem):
     def guards(self, t, x, q, args):
         return jnp.stack([self.p - x[0], x[0] - self.p])
 
-    def written(self, t, x, q, previous, events, args):
+    def written(self, t, x, read, q, previous, events, args):
         return x, jnp.where(events[0], jnp.ones_like(q), jnp.zeros_like(q))
 
     def settled(self, t, x, q, events, args):

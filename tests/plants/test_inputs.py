@@ -143,6 +143,18 @@ def test_what_a_branch_reads_is_read_again(lag):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("solver", [None, Rodas5P(), BDF()])
+def test_a_jump_at_the_end_is_not_seen(lag, solver):
+    """Stages of the last step would read the values from after the jump."""
+    plain = {"m.u": (np.array([0.0, 20.0]), np.array([1.0, 1.0]), "held")}
+    jumping = {"m.u": (np.array([0.0, 10.0]), np.array([1.0, 1e3]), "held")}
+    runs = [simulate(lag, 10.0, inputs=inputs, solver=solver, **FAST) for inputs in (plain, jumping)]
+    np.testing.assert_allclose(runs[1]["m.x"][-1], constant(1.0), rtol=2e-5)
+    assert runs[1].stats["num_steps"] < runs[0].stats["num_steps"] + 10 and runs[1].ts[-1] == 10.0
+    assert runs[1]["m.y"][-1] == 1e3
+
+
+@pytest.mark.slow
 def test_new_functions_of_the_same_form_share_a_program(lag):
     def call(gain, knots):
         return simulate(

@@ -92,8 +92,8 @@ def test_energy_of_cells():
 # --- a cell with heat ----------------------------------------------------------------------------------------------
 
 HEATED = {"cell.Q": 2.2, "cell.R0": 0.04, "cell.R1": 0.02, "cell.C1": 1.5e3, "cell.Ea": 2.5e4, "cell.dUdT": 3e-4,
-          "cell.gas_constant": GAS,
-          "cell.T_ref": 298.15, "cell.initial_soc": 0.9, "cell.initial_v1": -0.01, "cell.eta": 0.97, "body.C": 45.0,
+          "cell.gas_constant": GAS, "cell.T_ref": 298.15, "cell.initial_soc": 0.9, "cell.initial_voltage1": -0.01,
+          "cell.eta": 0.97, "body.C": 45.0,
           "body.initial_temperature": 285.0, "skin.h": 5.0, "skin.A": 0.004, "air.T": 280.0, "load.R": 0.9,
           **{f"cell.ocv{k}": float(v) for k, v in enumerate(OCV, 1)}}  # fmt: skip
 END = 1500.0
@@ -133,7 +133,7 @@ def heated_reference(values, ts):
         cooling = p["skin.h"] * p["skin.A"] * (T - p["air.T"])
         return [i / (3600 * p["cell.Q"]), (i - v1 / p["cell.R1"]) / p["cell.C1"], (heat - cooling) / p["body.C"]]
 
-    start = [p["cell.initial_soc"], p["cell.initial_v1"], p["body.initial_temperature"]]
+    start = [p["cell.initial_soc"], p["cell.initial_voltage1"], p["body.initial_temperature"]]
     y = scipy.integrate.solve_ivp(slopes, (0.0, ts[-1]), start, "DOP853", ts, rtol=1e-12, atol=1e-13).y
     return y, current(*y)[0]
 

@@ -362,7 +362,7 @@ def test_four_bar_linkage():
 
 @pytest.mark.slow
 def test_guesses_choose_the_position_of_a_loop():
-    crossed = four_bar().with_parameters({"coupler.body.initial_angle": -1.2, "rocker.body.initial_angle": -2.3})
+    crossed = four_bar(coupler_at=-1.2, rocker_at=-2.3)
     names = ["coupler.body.phi", "rocker.body.phi"]
     # The mirror image of the open position in the line from the crank's end to the rocker's pin.
     at, swing, *_ = loop(1.0, 0.8, 1.9, 1.5, 2.0)

@@ -7,6 +7,8 @@ from typing import Any, overload
 
 import numpy as np
 
+BLOCK = 4096  # names made at a time: whoever looks at the first few does not wait for a million
+
 
 class Paths(Sequence[str]):
     """The paths of all components, by number."""
@@ -73,8 +75,10 @@ class Names(Sequence[str]):
 
     def __iter__(self) -> Iterator[str]:
         paths, pieces = self.paths, self.pieces
-        for c, k in zip(self.owner.tolist(), self.piece.tolist(), strict=True):
-            yield pieces[k][0] + paths[c] + pieces[k][1]
+        for start in range(0, len(self.owner), BLOCK):
+            here = slice(start, start + BLOCK)
+            for c, k in zip(self.owner[here].tolist(), self.piece[here].tolist(), strict=True):
+                yield pieces[k][0] + paths[c] + pieces[k][1]
         yield from self.more
 
     @functools.cached_property

@@ -5,7 +5,8 @@ a number, and so may its derivative, which a product with zero does not remove. 
 its place, so that values and derivatives of any order, forward and reverse, never see it.
 """
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
 
 from .functions import TABLE
 from .node import Node, postorder
@@ -46,6 +47,34 @@ def needed_where(roots: Sequence[Node]) -> dict[Node, Needed]:
             for argument in node.arguments:
                 needed[argument] = union(needed[argument], here)
     return needed
+
+
+def guards(roots: Sequence[Node]) -> dict[Node, Needed]:
+    """The conditions under which nodes below the roots are needed that can be infinite or NaN elsewhere, as far as
+    these conditions can be evaluated before the node. A branch may stand in another condition, too: then it is needed
+    more often than its guard can tell."""
+    needed = needed_where(roots)
+    wanted = {n: parts for n, parts in needed.items() if parts != ALWAYS and is_partial(n)}
+    place = {n: k for k, n in enumerate(postorder(roots, lambda n: before(n, wanted)))}
+    if all(place[a] < place[n] for n in place for a in before(n, wanted)):
+        return wanted
+    kept: dict[Node, Needed] = {}
+    for n in postorder(roots):
+        if n in wanted:
+            parts = [{(c, holds) for c, holds in part if n not in _below(c, kept)} for part in wanted[n]]
+            if all(parts):
+                kept[n] = _shortened(frozenset(map(frozenset, parts)))
+    return kept
+
+
+def before(node: Node, guard: Mapping[Node, Needed]) -> tuple[Node, ...]:
+    """What is evaluated before a node: its arguments, and the conditions of its guard."""
+    conditions: set[Any] = {c for part in guard.get(node, ()) for c, _ in part}
+    return (*node.arguments, *sorted(conditions, key=lambda c: c.digest))
+
+
+def _below(node: Any, guard: Mapping[Node, Needed]) -> set[Node]:
+    return set(postorder([node], lambda n: before(n, guard)))
 
 
 def within(needed: Needed, literal: Literal) -> Needed:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...base.aliases import Numeric
-from .branches import ALWAYS, is_partial, needed_where
+from .branches import before, guards
 from .functions import TABLE
 from .node import Node, Number, postorder
 
@@ -28,14 +28,8 @@ class Kernel:
 
     def __init__(self, roots: Sequence[Node], labels: Sequence[Hashable]):
         position = {label: k for k, label in enumerate(labels)}
-        needed = needed_where(roots)
-        guard = {n: needed[n] for n in needed if needed[n] != ALWAYS and is_partial(n)}
-
-        def before(node: Node):
-            conditions: set[Any] = {c for part in guard.get(node, ()) for c, _ in part}
-            return (*node.arguments, *sorted(conditions, key=lambda c: c.digest))
-
-        order = postorder(roots, before)
+        guard = guards(roots)
+        order = postorder(roots, lambda node: before(node, guard))
         place = {n: k for k, n in enumerate(order)}
         self.leaves = [(place[n], position[n.data]) for n in order if n.operation == "leaf"]
         self.constants = [(place[n], _constant(n)) for n in order if n.operation in ("constant", "true", "false")]

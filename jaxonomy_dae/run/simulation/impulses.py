@@ -58,17 +58,16 @@ class _Impact(eqx.Module):
         strength = jnp.where(acting, self.strength, 0.0)
         acts, rate = q.at[place].set(strength), strength * self.e
 
-        def direction(y: Array, guess: Array) -> tuple[Array, Array]:
+        def direction(y: Array, guess: Array | None) -> tuple[Array, Array | None]:
             here = system.holding(acts)
-            x = jnp.concatenate([y[:n], guess])
-            x = here.at(t, args).refined(x, Refinement.ROOT) if len(guess) else x
+            x = y[:n] if guess is None else here.at(t, args).refined(jnp.append(y[:n], guess), Refinement.ROOT)
 
             def responds(rate: Array) -> tuple[Array, Array]:
                 on = system.holding(acts.at[table.rate].set(rate))
                 return on.vector_field(t, x, args), on.at(t, args).held_forces(x)
 
             _, (change, pushed) = jax.jvp(responds, (jnp.zeros_like(rate),), (rate,))
-            return jnp.concatenate([change[:n], pushed]), x[n:]
+            return jnp.concatenate([change[:n], pushed]), None if guess is None else x[n:]
 
         typical = jax.lax.stop_gradient(system.typical_sizes[system.plan.states])
         begin = jnp.concatenate([self.x[:n], jnp.zeros_like(rate)])
@@ -79,8 +78,11 @@ class _Impact(eqx.Module):
             return solved(change.dtype) * jnp.concatenate([states, pushed])
 
         moves = jnp.any(strength != 0)
-        end, guess, found = path_end(direction, begin, self.x[n:], allowed, moves)
-        after = jnp.concatenate([end[:n], guess])
+        # Not an array without entries: XLA (jaxlib 0.10.2) passes those on through nested loops, one at a time, gives
+        # up after ten, and then compiles no call of LAPACK that it has not come to.
+        guess = self.x[n:] if len(self.x) > n else None
+        end, guess, found = path_end(direction, begin, guess, allowed, moves)
+        after = end[:n] if guess is None else jnp.append(end[:n], guess)
         q = q.at[place].set(0.0)
         return q, after, end[n:], system.holding(q).at(t, args).held(after)[1][self.held.last], found
 

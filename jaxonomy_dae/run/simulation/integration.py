@@ -153,7 +153,8 @@ def run(
         parts.term, parts.solver, given.t0, given.t1, parts.dt0, parts.y0, given.inputs, save, parts.controller,
         options.adjoint, options.max_steps,
     )  # fmt: skip
-    done = integrate(integration, options.progress, checked, parts.goes_on)
+    # What happens at the end, such as a clock's tick, reads what holds from then on.
+    done = integrate(integration, options.progress, checked, parts.goes_on, before_jumps=parts.problem is None)
     rows = _rows(given, begin, parts, done)
     consistent = parts.consistent & parts.admitted
     # What is not a number here has derivatives that are not, so that a loss over failed rows cannot seem to have a

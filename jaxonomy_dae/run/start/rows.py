@@ -101,7 +101,8 @@ class _Generic:
 
     def entries(self, row: StartRow) -> list[tuple[int, float]]:
         """The columns on which a start row depends, and its gradient there, scaled."""
-        found = [] if row.quantity == ZERO else [(row.quantity, 1.0)]
+        # Quantities after the unknown ones are given from outside, as inputs are.
+        found = [(row.quantity, 1.0)] if ZERO != row.quantity < self.n else []
         for parameter, slope in self._slopes(row):
             found.append((self.n + self.solve_for.index(parameter), -slope / (row.factor or 1.0)))
         scaled = [(place, value * float(self.columns[place])) for place, value in found]

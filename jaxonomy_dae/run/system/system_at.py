@@ -342,7 +342,8 @@ class SystemAt:
             if small
             else jnp.linalg.solve(gram, value)
         )
-        return jnp.concatenate([x[:n] - nominal * (multiplier @ jacobian), x[n:]])
+        moved = x[:n] - nominal * (multiplier @ jacobian)
+        return jnp.append(moved, x[n:]) if len(x) > n else moved
 
     def _least_norm_of_few(self, state: Chunk) -> Array:
         """As `_least_norm_step` on scalars, which XLA fuses: products of small matrices take a pendulum three times as

@@ -36,6 +36,8 @@ def _of_one(entries: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 @_of_one.def_vmap
 def _(size, batched, entries):
+    if not batched[0]:
+        return _of_one(entries), False
     return jnp.moveaxis(_of_batch(jnp.moveaxis(entries, 0, -1)), -1, 0), True
 
 

@@ -2,6 +2,10 @@
 
 A kernel for CPUs computes anew what it reads, if that is cheap, and what that reads again: sums of products that many
 outputs share, exponentially often. What a call returns that XLA does not take apart is computed once.
+
+Functions with a `custom_vmap` that are differentiated have one argument, and return what is not batched as such. JAX
+(0.10.2) batches twice what only the tangents of one of several arguments have in batches; a `custom_jvp` around it does
+not help within loops, where JAX forgets it when it takes a gradient: Hessians of steady states failed.
 """
 
 from collections.abc import Sequence
@@ -43,6 +47,8 @@ def _once_in_batches(values):
 @_once_in_batches.def_vmap
 def _(size, batched, values):
     (batched,) = batched
+    if not any(batched):
+        return values, batched
     values = [v if b else jnp.broadcast_to(v, (size, *v.shape)) for v, b in zip(values, batched, strict=True)]
     return _once(values), [True] * len(values)
 
@@ -66,8 +72,8 @@ def _together(vector):
 
 @_together.def_vmap
 def _(size, batched, vector):
-    del size, batched
-    return joined([vector.T]).T, True
+    del size
+    return (joined([vector.T]).T, True) if batched[0] else (vector, False)
 
 
 @jax.custom_jvp
@@ -75,7 +81,7 @@ def stacked_in_batches(values: list[Any]) -> Any:
     """Scalars as a vector. In a batch each is computed by a loop of its own: XLA would compute all within the one that
     puts them together, anew for each of them and without vector instructions, which took five times as long for
     10,000 pendulums."""
-    return _stacked_together(values)
+    return jnp.stack([_apart(value) for value in values])
 
 
 @stacked_in_batches.defjvp
@@ -84,14 +90,14 @@ def _(primals, tangents):
 
 
 @jax.custom_batching.custom_vmap
-def _stacked_together(values):
-    return jnp.stack(values)
+def _apart(value):
+    return value
 
 
-@_stacked_together.def_vmap
-def _(size, batched, values):
-    values = [v if b else jnp.broadcast_to(v, (size,)) for v, b in zip(values, batched[0], strict=True)]
-    return stacked(values).T, True
+@_apart.def_vmap
+def _(size, batched, value):
+    del size
+    return (stacked([value])[0], True) if batched[0] else (value, False)
 
 
 @jax.jit

@@ -14,6 +14,7 @@ from .index_one import consistent_slope
 
 LARGE = 300  # unknowns up to which eigenvalues are looked at: they cost n³, some 0.1 s at 300
 NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
+HALVINGS = 20  # of an interval in which a jump is looked for: across a millionth of it, what is smooth is the same
 Slope = Callable[[Time, Array], Float[Array, " n"]]
 
 
@@ -76,21 +77,31 @@ def _jump(slope: Slope, here: np.ndarray, t: Time, y: State, weight: np.ndarray,
     does."""
     size = np.asarray(weight) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny)
     h = float(np.min(size))  # in which the fastest unknown moves by its tolerance
-    gaps = []
-    for scale in (1e2, 1e1, 1e0):
-        step = jnp.asarray(h * scale * here, y.dtype)
-        gaps.append(np.abs(np.asarray(slope(t, y + step)) - np.asarray(slope(t, y - step))))
-    if not np.isfinite(gaps).all():
-        return ""
-    wide, middle, narrow = gaps
-    # A jump has the same size at all scales; what is smooth, however steep, falls in proportion, and a pole rises.
-    alike = (np.minimum(narrow, middle) > 0.3 * wide) & (np.maximum(narrow, middle) < 3.0 * wide)
-    jumps = alike & (wide > 0.1 * np.max(np.abs(here)))
+
+    def at(place: float) -> np.ndarray:
+        return np.asarray(slope(t, y + jnp.asarray(place * here, y.dtype)))
+
+    # Steps chatter within some tolerances of the jump. Halving finds it there: the gap across a jump stays, what is
+    # smooth, however steep, falls with the interval, and a pole rises.
+    low, high = -1e2 * h, 1e2 * h
+    below, above = at(low), at(high)
+    wide = np.abs(above - below)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        between = at(middle)
+        if not np.isfinite((below, between, above)).all():
+            return ""
+        if np.max(np.abs(between - below) / weight) > np.max(np.abs(above - between) / weight):
+            high, above = middle, between
+        else:
+            low, below = middle, between
+    narrow = np.abs(above - below)
+    jumps = (narrow > 0.3 * wide) & (narrow < 3.0 * wide) & (narrow > 0.1 * np.max(np.abs(here)))
     if not jumps.any():
         return ""
-    k = int(np.argmax(np.where(jumps, wide / weight, 0)))
+    k = int(np.argmax(np.where(jumps, narrow / weight, 0)))
     return (
-        f"The derivative of '{names[k]}' jumps by {wide[k]:.3g} there (sign, Piecewise, Max, Heaviside …), and the "
+        f"The derivative of '{names[k]}' jumps by {narrow[k]:.3g} there (sign, Piecewise, Max, Heaviside …), and the "
         "solution stays at the jump: steps chatter back and forth across it. Smooth the law (sympy.tanh(x/small) for "
         "sign(x)), or, if the jump depends on time alone, name the times with jump_ts="
     )

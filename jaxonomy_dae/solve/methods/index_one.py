@@ -87,21 +87,22 @@ def consistent_point(
     eps = float(jnp.finfo(y.dtype).eps)
 
     def look(v, part, last):
-        factors, size = last
+        factors, size, weight = last
 
-        def length(of):
-            return jnp.max(jnp.abs(of) / (1 + jnp.abs(v)), initial=0.0)
+        def length(of, weight):
+            return jnp.max(jnp.abs(of) / weight, initial=0.0)
 
         _, right, _, matrix = index_matrix(still, linear, t_still, v)
         b = _off(still, right, v, y_still)
         # The restricted monotonicity test (Deuflhard 2004, section 3.3): the step from here, by the last matrix, must
-        # be shorter by a quarter of the part of the last step that was taken.
-        falls = (size <= SURE) | (length(chosen.apply(factors, None, b)) <= (1 - part / 4) * size)
-        new = chosen.factor(matrix)
+        # be shorter by a quarter of the part of the last step that was taken. Both are measured where the last one
+        # began: beside the values of a trial point that is far off, any step is short.
+        falls = (size <= SURE) | (length(chosen.apply(factors, None, b), weight) <= (1 - part / 4) * size)
+        new, weight = chosen.factor(matrix), 1 + jnp.abs(v)
         step = chosen.apply(new, None, b)
-        return Tried(falls, length(step) <= 10 * eps, step, (new, length(step)))
+        return Tried(falls, length(step, weight) <= 10 * eps, step, (new, length(step, weight), weight))
 
-    none = chosen.empty(y.shape[0], y.dtype), jnp.asarray(jnp.inf, y.dtype)
+    none = chosen.empty(y.shape[0], y.dtype), jnp.asarray(jnp.inf, y.dtype), jnp.ones_like(y)
     found = newton(look, y_still, none, max_steps + 1, SHORTEST)
     at = y + frozen(found.x - y_still)
     step = _newton_step(problem, linear, t, at, y)
