@@ -97,7 +97,7 @@ class Leftover:
         for j in dict.fromkeys(one.output for one in series):
             own = [one for one in series if one.output == j]
             at = np.concatenate([one.at for one in own])
-            found.append(signals(at, _parts(fit, own), leverage / share[:, None]))
+            found.append(signals(at, _parts(fit, own), leverage / share[:, None], o.has_variances))
         scores, loose = m.weights.scores(m.found.residual), []
         for j in np.unique(o.rows[2][known]):
             at = np.flatnonzero(known & (o.rows[2] == j))
@@ -247,16 +247,20 @@ def signals(
     at: Int[np.ndarray, " n"],
     parts: list[tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]],
     leverage: Float[np.ndarray, "m r"],
+    is_filter: bool = False,
 ) -> Signals:
     """The signals of one output: constants and drifts; its predictions, their rates, squares and cubes, and what these
     become if they drift; and inputs. A gain that is wrong shows as the prediction, a delay as its rate.
 
     - `parts`: (predictions, times, inputs by name) of each experiment.
+    - `is_filter`: whether each prediction is made from the samples before it. The next one then contains the present
+        error, so rates are those of the past.
     """
     rows = []
     for y, t, inputs in parts:
         tau = 2 * (t - t.mean()) / (np.ptp(t) or 1.0)
-        rows.append(np.stack([y, np.gradient(y, t), tau, *inputs.values()]))
+        rate = np.diff(y, prepend=y[:1]) / np.diff(t, prepend=2 * t[0] - t[1]) if is_filter else np.gradient(y, t)
+        rows.append(np.stack([y, rate, tau, *inputs.values()]))
     (y, rate, tau, *others) = (row - row.mean() for row in np.concatenate(rows, axis=1))
     found = {
         "a constant": np.ones_like(y), "the prediction": y, "the rate of change of the prediction": rate,
