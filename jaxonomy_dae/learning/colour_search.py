@@ -11,6 +11,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
+from ..host.threads import one_thread
 from .colour import Colour
 from .descent import Minimum
 from .evaluation import Weights
@@ -85,5 +86,8 @@ def _best(
 
     gaps = here.colour.gaps[own]
     low = -LARGEST if np.array_equal(gaps, np.rint(gaps)) else 0.0  # between samples, only ρ > 0 has a meaning
-    found = scipy.optimize.minimize_scalar(surprise, bounds=(low, LARGEST), method="bounded", options={"xatol": 1e-9})
+    with one_thread(len(residual) * jacobian.shape[1] ** 2):
+        found = scipy.optimize.minimize_scalar(
+            surprise, bounds=(low, LARGEST), method="bounded", options={"xatol": 1e-9}
+        )
     return float(found.x)  # pyright: ignore[reportAttributeAccessIssue]

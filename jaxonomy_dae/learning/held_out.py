@@ -14,6 +14,7 @@ import scipy.stats
 from jaxtyping import Float
 from scipy.special import chdtrc
 
+from ..host.threads import one_thread
 from .colour import Colour
 from .noise import Tails
 from .objective import Objective
@@ -57,7 +58,8 @@ def missed(
         free = len(u) - own.shape[1]
         if free < 1:
             continue
-        spread = np.linalg.svd(left_by(taken, by_all @ root), compute_uv=False) ** 2
+        with one_thread(len(u) * root.shape[1] ** 2):
+            spread = np.linalg.svd(left_by(taken, by_all @ root), compute_uv=False) ** 2
         u = left_by(taken, Tails(*s.tails[rows[2]].T).scores(u))
         mean, variance = free + np.sum(spread), 2 * (free + np.sum(2 * spread + spread**2))
         ratio, count = np.sum(u**2) / mean, 2 * mean**2 / variance

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import chdtr, chdtrc
 
+from ..host.threads import one_thread
 from .outliers import heavy_tails, outliers
 
 if TYPE_CHECKING:
@@ -117,7 +118,8 @@ class Leftover:
 
     @functools.cached_property
     def _factors(self) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, " k"]]:
-        left, sizes, _ = np.linalg.svd(self.leverage, full_matrices=False)
+        with one_thread(len(self.leverage) * self.leverage.shape[1] ** 2):
+            left, sizes, _ = np.linalg.svd(self.leverage, full_matrices=False)
         return left, np.minimum(sizes, 1.0)
 
     @functools.cached_property
