@@ -15,7 +15,6 @@ from ...solve.events.problem import AbstractHybridProblem
 from ...solve.methods.switching import Watch
 from ...write.events import EventFlag
 from ..start.after_event import with_blocks_solved
-from ..system.inputs import reached
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .impulses import struck
@@ -57,7 +56,7 @@ class SystemProblem(AbstractHybridProblem):
         return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
     def written(self, t, x, read, q, previous, events, args):
-        plan, args = self.events, reached(args, self.resolution)
+        plan = self.events
         values = self.system.around_event(t, q, previous, args).event_values(read)
         happens = events[plan.table.event]
         is_state, is_discrete = plan.state >= 0, plan.table.discrete >= 0
@@ -77,7 +76,7 @@ class SystemProblem(AbstractHybridProblem):
         return jnp.where(done, self.admitted(t, x, q, args), jnp.nan), q
 
     def settled(self, t, x, q, events, args):
-        table, args = self.events.table, reached(args, self.resolution)
+        table = self.events.table
         assigns = table.discrete >= 0
         values = self.system.around_event(t, q, q, args).event_values(x)[assigns]
         # More than one event may write a value, but then the same.

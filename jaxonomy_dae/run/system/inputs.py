@@ -63,16 +63,6 @@ class Entry(eqx.Module):
         return jnp.ravel(found)[self.index] if jnp.ndim(found) else found
 
 
-def reached(inputs: Any, within: Any) -> Any:
-    """Inputs whose held samples count from `within` before their times on: at an instant that differs from the time of
-    a sample by rounding, the sample is the new one."""
-
-    def sooner(path: Any) -> Any:
-        return HeldPath(path.ts - within, path.ys) if isinstance(path, HeldPath) else path
-
-    return jax.tree.map(sooner, inputs, is_leaf=lambda part: isinstance(part, HeldPath))
-
-
 def value_at(source: Any, t: Any) -> Any:
     """The value of what has been read, at a time."""
     return source(t) if callable(source) else source

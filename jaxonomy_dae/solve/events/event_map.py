@@ -177,8 +177,7 @@ class _Events(NamedTuple):
             delay = jnp.where(is_clock, delay, crossing)
         if c and not self.at_start:
             exact = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
-            # A step may end some floating-point numbers before the tick, at a jump of what equations read.
-            delay = jnp.where(is_clock, exact - lax.stop_gradient(jnp.minimum(exact, self.t)), delay)
+            delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
         # Parts that strike at the same instant do so at once, whatever the order: a box that falls flat does not turn.
         # All share the δ of the first: if a parameter parts their instants, the derivative is one-sided, as at any
         # kink.
