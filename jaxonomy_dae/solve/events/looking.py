@@ -152,9 +152,7 @@ def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> M
     last = values[-1]
 
     def reaches_zero(rate):
-        # A step that was shortened to end at zero does so up to the rounding of the terms of the guard.
-        rounded = jnp.minimum(band, -rate * (AHEAD * span))
-        return (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, rounded))
+        return (rate < 0) & (jnp.abs(last) <= -rate * window)
 
     def at_end():
         before = problem.slope(t1, x1, q, args)
