@@ -15,6 +15,7 @@ from ...solve.events.problem import AbstractHybridProblem
 from ...solve.methods.switching import Watch
 from ...write.events import EventFlag
 from ..start.after_event import with_blocks_solved
+from ..system.inputs import from_then_on
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .impulses import struck
@@ -56,7 +57,7 @@ class SystemProblem(AbstractHybridProblem):
         return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
     def written(self, t, x, read, q, previous, events, args):
-        plan = self.events
+        plan, args = self.events, self.at_instant(args)
         values = self.system.around_event(t, q, previous, args).event_values(read)
         happens = events[plan.table.event]
         is_state, is_discrete = plan.state >= 0, plan.table.discrete >= 0
@@ -75,9 +76,13 @@ class SystemProblem(AbstractHybridProblem):
         x, q, done = struck(self.system, t, x, before, q, args)
         return jnp.where(done, self.admitted(t, x, q, args), jnp.nan), q
 
+    def at_instant(self, args: Args) -> Args:
+        """The inputs as events read them."""
+        return from_then_on(args, self.resolution) if args else args
+
     def settled(self, t, x, q, events, args):
         table = self.events.table
-        assigns = table.discrete >= 0
+        assigns, args = table.discrete >= 0, self.at_instant(args)
         values = self.system.around_event(t, q, q, args).event_values(x)[assigns]
         # More than one event may write a value, but then the same.
         new = (

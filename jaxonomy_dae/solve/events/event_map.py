@@ -122,7 +122,8 @@ class _Events(NamedTuple):
         )
         now = self._happening(instant, jnp.where(jnp.any(together), jnp.argmax(together), c + g))
         event, delay = now.event, now.delay
-        time, reached = t + delay, state.x + instant.slope * delay
+        # A step may end a rounding error off the tick: what equations read at a tick, they read at its own time.
+        time, reached = jnp.where(now.is_clock, now.tick, t + delay), state.x + instant.slope * delay
         x, written = problem.written(time, reached, base + base_slope * delay, q, previous, now.these, args)
         now = now._replace(moved=jnp.any(x != reached) & ~self.relations[event])
         after = aftermath(problem, t, x, written, instant, arrival, now, args)
@@ -172,12 +173,13 @@ class _Events(NamedTuple):
         is_clock = event < c
         delay, rates = jnp.zeros_like(self.t), self.arrival.rate
         rose = onto = jnp.zeros((g,), bool)
+        tick = self.t
         if g and not self.at_start:
             crossing, rates, rose, onto = _crossing(self, instant, event)
             delay = jnp.where(is_clock, delay, crossing)
         if c and not self.at_start:
-            exact = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
-            delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
+            tick = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
+            delay = jnp.where(is_clock, tick - lax.stop_gradient(tick), delay)
         # Parts that strike at the same instant do so at once, whatever the order: a box that falls flat does not turn.
         # All share the δ of the first: if a parameter parts their instants, the derivative is one-sided, as at any
         # kink.
@@ -185,7 +187,7 @@ class _Events(NamedTuple):
         if self.several:
             these = these | (instant.left & self.strikes & self.strikes[event])
         return Happening(
-            event=event, is_clock=is_clock, these=these, delay=delay, rates=rates, moved=np.False_,
+            event=event, is_clock=is_clock, tick=tick, these=these, delay=delay, rates=rates, moved=np.False_,
             approach=jnp.where(instant.caused | self.at_start, 0.0, rates), rose=rose, onto=onto, waits=self.waits,
         )  # fmt: skip
 

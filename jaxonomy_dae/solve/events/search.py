@@ -66,5 +66,5 @@ def first_crossing(
         low, high, *_, k = carry
         return going & (k < ITERATIONS) & (high - low > floor)
 
-    begin = (low, high, jnp.maximum(at_low, 0.0), at_high, jnp.zeros((), jnp.int32))
+    begin = (low, high, jnp.maximum(at_low, 0.0), at_high, jnp.zeros_like(whole))
     return jnp.where(going, lax.while_loop(unfinished, body, begin)[0], high)
