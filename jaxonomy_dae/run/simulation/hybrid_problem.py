@@ -15,7 +15,7 @@ from ...solve.events.problem import AbstractHybridProblem
 from ...solve.methods.switching import Watch
 from ...write.events import EventFlag
 from ..start.after_event import with_blocks_solved
-from ..system.inputs import from_then_on
+from ..system.inputs import any_held, from_then_on
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .impulses import struck
@@ -56,8 +56,11 @@ class SystemProblem(AbstractHybridProblem):
     def clocks(self):
         return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
+    def at_instant(self, args):
+        return (from_then_on(args, self.resolution), any_held(args)) if args else (args, False)
+
     def written(self, t, x, read, q, previous, events, args):
-        plan, args = self.events, self.at_instant(args)
+        plan = self.events
         values = self.system.around_event(t, q, previous, args).event_values(read)
         happens = events[plan.table.event]
         is_state, is_discrete = plan.state >= 0, plan.table.discrete >= 0
@@ -76,13 +79,9 @@ class SystemProblem(AbstractHybridProblem):
         x, q, done = struck(self.system, t, x, before, q, args)
         return jnp.where(done, self.admitted(t, x, q, args), jnp.nan), q
 
-    def at_instant(self, args: Args) -> Args:
-        """The inputs as events read them."""
-        return from_then_on(args, self.resolution) if args else args
-
     def settled(self, t, x, q, events, args):
         table = self.events.table
-        assigns, args = table.discrete >= 0, self.at_instant(args)
+        assigns = table.discrete >= 0
         values = self.system.around_event(t, q, q, args).event_values(x)[assigns]
         # More than one event may write a value, but then the same.
         new = (
