@@ -173,9 +173,11 @@ def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> M
     bent = jnp.any(bent)
     long = h > 1e3 * jnp.maximum(WINDOW * h, problem.resolution)
     bent = bent & long
-    # In a step too short to be split, a guard that crossed zero has jumped.
-    jumped = jnp.any(crossed, axis=0) & ~near & short
-    near = near | jumped
+    # In a step too short to be split, a guard that crossed zero has jumped, unless rounding alone could take it there:
+    # where it meets zero flatly, its sign is that of its rounding errors.
+    falls = jnp.any(crossed, axis=0) & ~near & short
+    jumped = falls & (size > band)
+    near = near | falls
     within = jnp.any(crossed[:-1], axis=0) & ~short
     inside = jnp.any(within | (crossed[-1] & ~near))
 
