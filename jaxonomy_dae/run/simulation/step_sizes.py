@@ -22,6 +22,8 @@ from ..system.system_at import SystemAt
 from .controlled_variables import with_variables
 from .wave_control import AtWaves
 
+HERE = 8  # roundings, within which two times are one
+
 
 def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Tolerance:
     """The absolute tolerance of each entry of the state, shape (n_state,): in units of its nominal value, or of its
@@ -76,8 +78,10 @@ class AtTimes(End):
         return AtTimes(jnp.sort(self.ts * direction))
 
     def moved(self, start: Time, end: Time) -> Time:
-        """The end of a step, or the first of the times if that is before it."""
-        k = jnp.searchsorted(self.ts, start, side="right")
+        """The end of a step, or the first of the times if that is before it. Times within rounding of the start have
+        passed: where another input jumps at one of them, a step ends just before the jump."""
+        passed = start + HERE * jnp.finfo(start.dtype).eps * jnp.abs(start)
+        k = jnp.searchsorted(self.ts, jax.lax.stop_gradient(passed), side="right")
         ahead = jnp.where(k < len(self.ts), self.ts[jnp.minimum(k, len(self.ts) - 1)], jnp.inf)
         return jnp.minimum(end, ahead.astype(end.dtype))
 
