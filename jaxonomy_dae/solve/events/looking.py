@@ -53,6 +53,12 @@ def _between(place: Array, values: Array) -> Array:
     return weights @ values / jnp.sum(weights)
 
 
+def _apart(n: int) -> np.ndarray:
+    """Factors from 1 to 2, no two of them alike: by these, errors of states that are equal do not cancel. They are
+    multiples of the golden ratio, which are the farthest apart (Knuth, volume 3, section 6.4)."""
+    return 1.0 + np.arange(n) * (0.5 * (np.sqrt(5.0) - 1.0)) % 1.0
+
+
 class _Step(NamedTuple):
     """The step from y0 at t0 to x1 at t1, whose states are `dense(t0, t1, t)`; not differentiated."""
 
@@ -151,17 +157,21 @@ def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> M
     crossed = armed[:-1] & (below | stays)
     last = values[-1]
 
-    def reaches_zero(rate):
-        return (rate < 0) & (jnp.abs(last) <= -rate * window)
+    def reaches_zero(rate, doubt):
+        # A step that was shortened to end at zero does so up to rounding.
+        return (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, jnp.minimum(doubt, -rate * (AHEAD * span))))
 
     def at_end():
         before = problem.slope(t1, x1, q, args)
-        return before, reaches_zero(problem.rates(t1, x1, q, args, before)[1])
+        # How much of a guard is rounding in the states: little, where it meets zero flatly, whatever its values were.
+        along = jnp.stack([before, jnp.asarray(_apart(len(x1)), x1.dtype) * x1])
+        rate, by_rounding = jax.vmap(lambda direction: problem.rates(t1, x1, q, args, direction)[1])(along)
+        return before, reaches_zero(rate, rounding(jnp.abs(by_rounding)))
 
     # A step so short that points inside cannot be distinguished from its ends.
     short = h <= 4 * problem.resolution
     if problem.facts.only_kinks:
-        before, near = jnp.zeros_like(x1), reaches_zero(jnp.asarray(_RATE_AT_END, values.dtype) @ values / h)
+        before, near = jnp.zeros_like(x1), reaches_zero(jnp.asarray(_RATE_AT_END, values.dtype) @ values / h, band)
     else:
         doubtful = jnp.any(armed[-1] & (last <= CLOSE * size)) | jnp.any(ticking) | short
         before, near = lax.cond(any_member(doubtful), at_end, lambda: (jnp.zeros_like(x1), jnp.zeros((g,), bool)))

@@ -22,8 +22,8 @@ def first_crossing(
     at_high: Array,
     going: Array,
 ) -> Array:
-    """The last place before the first zero of the guards that are `falling`, positive at `low` and not so at `high`; where
-    none is wanted, without `going`, that is `high`.
+    """The last place before the first zero of the guards that are `falling`, positive at `low` and not so at `high`;
+    where none is wanted, without `going`, that is `high`.
 
     Only signs decide where the zero is: a guard may meet zero as flatly as it will, or stay there, as max(1 − t, 0)
     does. The last time at which it is positive is returned: there it still has the rate at which it falls.
