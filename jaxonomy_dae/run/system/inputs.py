@@ -50,6 +50,16 @@ class SampledInput(eqx.Module):
         return self.path.evaluate(t)
 
 
+def as_after(inputs: Any, within: Any) -> Any:
+    """Inputs whose held samples count from a little earlier, by the time `within`: at an instant, the new one is read
+    whatever rounding says of its time."""
+
+    def earlier(path: Any) -> Any:
+        return HeldPath(path.ts - jax.lax.stop_gradient(within), path.ys) if isinstance(path, HeldPath) else path
+
+    return jax.tree.map(earlier, inputs, is_leaf=lambda leaf: isinstance(leaf, HeldPath))
+
+
 class Entry(eqx.Module):
     """One input of an array of them: `index` counts its entries row by row."""
 

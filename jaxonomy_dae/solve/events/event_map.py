@@ -7,7 +7,7 @@ rounding; its derivative is that of the time of the crossing, by the implicit fu
 
 has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its derivative (Aizerman & Gantmacher 1958). Its
 second derivative is not that of the flow, and is refused. A clock ticks at τ = offset + k·period, a function of
-parameters, in the same manner.
+parameters, in the same manner. What is held from one sample to the next is read at an instant as it is after it.
 """
 
 import math
@@ -177,7 +177,8 @@ class _Events(NamedTuple):
             delay = jnp.where(is_clock, delay, crossing)
         if c and not self.at_start:
             exact = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
-            delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
+            late = jnp.clip(lax.stop_gradient(exact) - self.t, 0, problem.resolution)  # a step ends up to rounding
+            delay = jnp.where(is_clock, exact - lax.stop_gradient(exact) + late, delay)
         # Parts that strike at the same instant do so at once, whatever the order: a box that falls flat does not turn.
         # All share the δ of the first: if a parameter parts their instants, the derivative is one-sided, as at any
         # kink.

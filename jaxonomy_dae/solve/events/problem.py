@@ -68,6 +68,10 @@ class AbstractHybridProblem(eqx.Module):
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
         """Periods and offsets of the sampled events; the period is infinite for one that happens once."""
 
+    def at_instant(self, args: Args) -> Args:
+        """Arguments as the events of an instant read them: what jumps there has jumped, whatever rounding says."""
+        return args
+
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
         """The time of the next tick of each clock, given the number of ticks so far."""
         period, offset = self.clocks()
