@@ -29,8 +29,8 @@ def first_crossing(
     does. The last time at which it is positive is returned: there it still has the rate at which it falls.
 
     The places are those of ITP (Oliveira & Takahashi, ACM Transactions on Mathematical Software 47, 2020) for the guard
-    that comes first by linear interpolation: it takes one evaluation more than bisection at worst, and one for rounding, and few where the
-    guard is nearly linear.
+    that comes first by linear interpolation: it takes one evaluation more than bisection at worst, and one for
+    rounding, and few where the guard is nearly linear.
     """
     eps = jnp.finfo(jnp.result_type(high)).eps
     tiny = jnp.finfo(jnp.result_type(at_low)).tiny
