@@ -131,7 +131,8 @@ def test_the_first_of_several_crossings():
 
 @pytest.mark.parametrize("power", [1, 3, 5, 9])
 def test_a_guard_may_meet_zero_flatly(power):
-    """Signs decide, so that the place is as exact for a ninth power as for a line, and costs as bisection at worst."""
+    """Signs decide, so that the place is as exact for a ninth power as for a line. Bisection to 1e-13 takes 44 looks,
+    ITP one more, and the rounding of the last bracket another one."""
     looks = []
 
     def guards(t):
@@ -142,7 +143,7 @@ def test_a_guard_may_meet_zero_flatly(power):
     found = first_crossing(guards, yes, low, high, guards(low), guards(high), jnp.array(True))
     jax.effects_barrier()
     np.testing.assert_allclose(found, 0.3, rtol=0, atol=2e-13)
-    assert len(looks) - 2 <= (10 if power == 1 else 45)
+    assert len(looks) - 2 <= (10 if power == 1 else 46)
 
 
 def test_a_search_that_is_not_wanted_costs_nothing():

@@ -10,7 +10,7 @@ SHORTEST = 1e-13
 # Oliveira & Takahashi (2020), section 3: how far the estimate is moved towards the middle, as a part of the bracket
 # (relative to its first length), and how many more evaluations than by bisection there may be.
 TRUNCATION, SLACK = 0.2, 1
-ITERATIONS = 48  # never reached: 43 bisections make a bracket as short as SHORTEST
+ITERATIONS = 48  # never reached: 44 bisections make a bracket as short as SHORTEST
 
 
 def first_crossing(
@@ -29,8 +29,8 @@ def first_crossing(
     does. The last time at which it is positive is returned: there it still has the rate at which it falls.
 
     The places are those of ITP (Oliveira & Takahashi, ACM Transactions on Mathematical Software 47, 2020) for the guard
-    that comes first by linear interpolation: it takes one evaluation more than bisection at worst, and few where the
-    guard is nearly linear.
+    that comes first by linear interpolation: it takes one evaluation more than bisection at worst, and one for
+    rounding, and few where the guard is nearly linear.
     """
     eps = jnp.finfo(jnp.result_type(high)).eps
     tiny = jnp.finfo(jnp.result_type(at_low)).tiny
