@@ -52,6 +52,29 @@ class SampledInput(eqx.Module):
         return self.path.evaluate(t)
 
 
+def any_held(inputs: Mapping[str, Any]) -> bool:
+    """True if there are samples that are held."""
+    return any(isinstance(source, SampledInput) and source.smoothness < 0 for source in map(_whole, inputs.values()))
+
+
+def _whole(source: Any) -> Any:
+    return source.source if isinstance(source, Entry) else source
+
+
+def from_then_on(inputs: Mapping[str, Any], resolution: Any) -> dict[str, Any]:
+    """Inputs as what happens at an instant reads them: a sample that is held from that instant on is the new one, on
+    whichever side of it rounding has put the sample's time. Times closer than the `resolution` are one instant."""
+
+    def read(source: Any) -> Any:
+        if isinstance(source, Entry):
+            return Entry(read(source.source), source.index)
+        if isinstance(source, SampledInput) and isinstance(source.path, HeldPath):
+            return SampledInput(HeldPath(source.path.ts - resolution, source.path.ys), source.smoothness)
+        return source
+
+    return {name: read(source) for name, source in inputs.items()}
+
+
 class Entry(eqx.Module):
     """One input of an array of them: `index` counts its entries row by row."""
 

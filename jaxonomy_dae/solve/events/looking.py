@@ -152,9 +152,7 @@ def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> M
     last = values[-1]
 
     def reaches_zero(rate):
-        # A step that was shortened to end at zero does so up to the rounding of the terms of the guard.
-        rounded = jnp.minimum(band, -rate * (AHEAD * span))
-        return (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, rounded))
+        return (rate < 0) & (jnp.abs(last) <= -rate * window)
 
     def at_end():
         before = problem.slope(t1, x1, q, args)
@@ -168,12 +166,18 @@ def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> M
         doubtful = jnp.any(armed[-1] & (last <= CLOSE * size)) | jnp.any(ticking) | short
         before, near = lax.cond(any_member(doubtful), at_end, lambda: (jnp.zeros_like(x1), jnp.zeros((g,), bool)))
     near = near & armed[-1]
-    bent = jnp.any(off > jnp.maximum(BEND * size, band))
+    # One that falls or rises from look to look crosses zero once, however it bends: where it does so flatly, as h³, the
+    # halves would bend as much, without end. The polynomial through the looks is not good enough for it.
+    monotone = jnp.all(rise < 0, axis=0) | jnp.all(rise > 0, axis=0)
+    bent = (off > jnp.maximum(BEND * size, band)) & (problem.facts.only_kinks | ~monotone)
+    bent = jnp.any(bent)
     long = h > 1e3 * jnp.maximum(WINDOW * h, problem.resolution)
     bent = bent & long
-    # In a step too short to be split, a guard that crossed zero has jumped.
-    jumped = jnp.any(crossed, axis=0) & ~near & short
-    near = near | jumped
+    # In a step too short to be split, a guard that crossed zero has jumped, unless rounding alone could take it there:
+    # where it meets zero flatly, its sign is that of its rounding errors.
+    falls = jnp.any(crossed, axis=0) & ~near & short
+    jumped = falls & (size > band)
+    near = near | falls
     within = jnp.any(crossed[:-1], axis=0) & ~short
     inside = jnp.any(within | (crossed[-1] & ~near))
 
@@ -204,7 +208,11 @@ def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> M
 def _dip(values, armed, crossed, doubt):
     """The place (a fraction of the step) where a guard that is positive at all looks has the minimum of the parabola
     through its values at both ends and in the middle, if that minimum is below `doubt`; infinity otherwise. The caller
-    ends the step there and looks again, until the minimum is decided."""
+    ends the step there and looks again, until the minimum is decided.
+
+    A guard that falls at the end of the step and from look to look has no minimum inside, whatever the parabola says:
+    it has one in a later step.
+    """
     left, middle, right = values[jnp.array(FITTED)]
     bend = 2 * (left - 2 * middle + right)
     slope = 4 * middle - 3 * left - right
@@ -214,5 +222,7 @@ def _dip(values, armed, crossed, doubt):
     before = jnp.sum(jnp.asarray(LOOKS, values.dtype)[:, None] <= place, axis=0) - 1
     was_armed = jnp.take_along_axis(armed, jnp.clip(before, 0, len(LOOKS) - 1)[None], axis=0)[0]
     lowest = left + 0.5 * slope * place
-    dips = curved & was_armed & ~crossed & (1e-3 < place) & (place < 1) & (lowest < doubt)
+    rate_at_end = jnp.asarray(_RATE_AT_END, values.dtype) @ values
+    turns = jnp.any(values[1:] >= values[:-1], axis=0) | (rate_at_end > 0)
+    dips = curved & turns & was_armed & ~crossed & (1e-3 < place) & (place < 1) & (lowest < doubt)
     return jnp.min(jnp.where(dips, place, jnp.inf))
