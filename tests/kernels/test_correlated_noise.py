@@ -58,7 +58,7 @@ def test_no_correlation_beyond_one(rho):
 def test_unknown_keywords_are_explained():
     """Kind: a raw TypeError."""
     with pytest.raises(ModelError, match="powers: there is no argument 'high': did you mean 'highest'"):
-        powers(high=3)
+        powers(high=3)  # pyright: ignore[reportCallIssue]
 
 
 def test_tails_are_judged_as_scipy_does():

@@ -157,7 +157,7 @@ def test_noise_of_first_order():
         found.append(fit.ok)
     assert 0.9 <= np.mean(inside) <= 0.99 and np.mean(found) >= 0.92
     lags = np.abs(np.subtract.outer(np.arange(200), np.arange(200)))
-    law = scipy.stats.multivariate_normal(cov=fit.sigma["c.x"] ** 2 * fit.rho["c.x"] ** lags)
+    law: Any = scipy.stats.multivariate_normal(cov=fit.sigma["c.x"] ** 2 * fit.rho["c.x"] ** lags)  # pyright: ignore[reportArgumentType]
     there = swing(fit.values["c.k"], fit.values["c.d"])
     assert fit.log_likelihood == pytest.approx(law.logpdf(data.data["c.x"] - there), rel=1e-6)
     new = record(swing() + NOISE * noise(9, 0.6), "estimate")
