@@ -1,8 +1,9 @@
 """The functions that every Modelica model may call."""
 
+import contextlib
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import sympy
 
@@ -17,10 +18,7 @@ def of_numbers(number: Callable[..., float], symbol: Callable[..., Value]) -> Ca
     def one(*arguments: Value) -> Value:
         arguments = tuple(map(as_number, arguments))
         if all(isinstance(a, int | float) for a in arguments):
-            try:
-                return number(*arguments)
-            except (ValueError, OverflowError, ZeroDivisionError) as error:
-                raise ModelError(f"{getattr(symbol, '__name__', symbol)}{arguments}: {error}") from None
+            return number(*arguments)
         return symbol(*map(sympy.sympify, arguments))
 
     return lambda *arguments: entrywise(one, *arguments)
@@ -117,6 +115,8 @@ def _innermost(value: list) -> list:
 
 
 def _linspace(first: Value, last: Value, count: int) -> list:
+    if count < 2:
+        raise ModelError(f"linspace needs two points or more; got {count}")
     return [first + (last - first) * k / (count - 1) for k in range(int(count))]
 
 
@@ -182,9 +182,33 @@ FUNCTIONS: dict[str, Callable[..., Value]] = {
 }
 
 
+def applied(name: str, arguments: Sequence[Value], named: Mapping[str, Value]) -> Value:
+    """The value of a built-in function.
+
+    **Raises:**
+
+    - `ModelError` for numbers of which it has none.
+    """
+    with numbers_checked(lambda: f"{name}({', '.join(map(str, arguments))})"):
+        return FUNCTIONS[name](*arguments, **named)
+
+
+@contextlib.contextmanager
+def numbers_checked(what: Callable[[], str]) -> Iterator[None]:
+    """Errors of Python's arithmetic as one that says what was computed."""
+    try:
+        yield
+    except ModelError:
+        raise
+    except (ArithmeticError, ValueError) as error:
+        raise ModelError(f"{what()}: {error}") from None
+
+
 def power(a: Value, b: Value) -> Value:
     if isinstance(a, int | float) and isinstance(b, int | float):
-        return a**b if a >= 0 or float(b).is_integer() else math.nan
+        found = a**b if a >= 0 or float(b).is_integer() else math.nan
+        float(found)  # an integer may be too large to be a Real
+        return found
     if isinstance(b, float) and b.is_integer():
         b = int(b)
     return sympy.sympify(a) ** b

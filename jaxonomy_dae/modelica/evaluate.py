@@ -10,7 +10,7 @@ import sympy
 from ..base.errors import ModelError
 from ..write.symbols import VariableSymbol, der
 from . import tree
-from .builtin import FUNCTIONS, matrix_product
+from .builtin import FUNCTIONS, applied, matrix_product, numbers_checked
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
 from .read_base import FUNCTION
@@ -153,7 +153,8 @@ class Evaluator:
             b = self.named(sympy.Float(0))  # in a branch that is never taken, as a ramp that takes no time
         if isinstance(a, Record) or isinstance(b, Record):
             return of_complex_numbers(sign, a, b)
-        return entrywise(ARITHMETIC[sign.removeprefix(".")], a, b)
+        with numbers_checked(lambda: f"{a} {sign} {b}"):
+            return entrywise(ARITHMETIC[sign.removeprefix(".")], a, b)
 
     def _compared(self, value: Value) -> Value:
         """A side of a relation. A choice in it that moves gets a name: SymPy would spread the relation over all
@@ -234,7 +235,7 @@ class Evaluator:
         arguments = [self.evaluate(a, names) for a in e.arguments]
         named = {k: self.evaluate(v, names) for k, v in e.named}
         if name in FUNCTIONS:
-            return FUNCTIONS[name](*arguments, **named)
+            return applied(name, arguments, named)
         if name not in self.classes and "." not in name:
             try:
                 return names(name)(*arguments, **named)

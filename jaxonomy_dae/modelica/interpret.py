@@ -11,7 +11,7 @@ import sympy
 
 from ..base.errors import ModelError, nearest
 from . import tree
-from .builtin import FUNCTIONS, filled
+from .builtin import FUNCTIONS, applied, filled
 from .evaluate import Evaluator, Names, index_of, local_names, with_end
 from .values import Record, Results, Value, chosen, either, negated
 
@@ -34,7 +34,7 @@ class Interpreter(Evaluator):
         function = self.classes.get(name)
         if function is None or function.external is not None:
             if name.startswith("Modelica.Math.") and last in FUNCTIONS:
-                return FUNCTIONS[last](*arguments, **named)
+                return applied(last, arguments, named)
         if function is None:
             more = "; load(…, roots=[…]) reads it from the sources of its library" if "." in name else ""
             near = nearest(name, [*FUNCTIONS, *self.classes])

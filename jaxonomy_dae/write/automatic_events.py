@@ -200,8 +200,7 @@ class _Rewriting:
             return _FORMS[type(e)](functools.partial(self._turns, [e]), functools.partial(self._stepping, e), *inside)
         if all(new is old for new, old in zip(inside, e.args, strict=True)):
             return e
-        # SymPy draws a power of branches into them.
-        return e.func(*inside, **({"evaluate": False} if inside[0].has(sympy.Piecewise) and e.is_Pow else {}))
+        return e.func(*inside)
 
     def _piecewise(self, e: Expression) -> Expression:
         pairs = []

@@ -41,3 +41,18 @@ def test_numbers_are_parameters_of_the_text():
     for name in ("u", "q"):
         with pytest.raises(ModelError, match=f"numbers: 'm' has no parameter '{name}'"):
             compiled(numbers=[name])
+
+
+@pytest.mark.parametrize(
+    "written, said",
+    [
+        ("0^(-1)", r"0 \^ -1: 0\.0 cannot be raised"), ("10^400", r"10 \^ 400: int too large"),
+        ("sum(linspace(0, 1, 1))", "linspace needs two points or more; got 1"), ("div(1, 0)", r"div\(1, 0\): "),
+        ("sqrt(-1)", r"sqrt\(-1\): math domain error"),
+    ],
+)  # fmt: skip
+def test_numbers_that_there_are_not(written, said):
+    """Python's errors of arithmetic came without a line."""
+    text = TEXT.replace("'c' = 2.0", f"'c' = {written}")
+    with pytest.raises(ModelError, match=rf"line \d+: {said}"):
+        FlatComponent(EqnEnv(), "m", load(text))

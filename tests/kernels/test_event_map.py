@@ -129,6 +129,22 @@ def test_the_first_of_several_crossings():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("power", [1, 3, 5, 9])
+def test_a_guard_may_meet_zero_flatly(power):
+    """Signs decide, so that the place is as exact for a ninth power as for a line, and costs as bisection at worst."""
+    looks = []
+
+    def guards(t):
+        jax.debug.callback(looks.append, t)
+        return jnp.stack([(0.3 - t) ** power])
+
+    low, high, yes = jnp.zeros(()), jnp.ones(()), jnp.ones((1,), bool)
+    found = first_crossing(guards, yes, low, high, guards(low), guards(high), jnp.array(True))
+    jax.effects_barrier()
+    np.testing.assert_allclose(found, 0.3, rtol=0, atol=2e-13)
+    assert len(looks) - 2 <= (10 if power == 1 else 45)
+
+
 def test_a_search_that_is_not_wanted_costs_nothing():
     """Members of a batch in which nothing crosses end where the step does."""
 

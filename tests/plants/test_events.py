@@ -15,12 +15,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sympy
 from component_references import checks, measured
 from hybrid_models import Ball, Commensurate, Doubling, Gear, SampledPI, Stick, Thermostat, Twice, compiled
 from hybrid_references import BOUNCES, HEIGHT, SIXTH_BY_E, SLOPES, commensurate_counts
 from problems import compiled as joined
+from sympy import Eq
 
-from jaxonomy_dae import AcausalSystem, EqnEnv, ModelError, SimulationError, simulate
+from jaxonomy_dae import (
+    AcausalSystem,
+    Component,
+    EqnEnv,
+    ModelError,
+    SimulationError,
+    assign,
+    der,
+    pre,
+    reinit,
+    simulate,
+)  # fmt: skip
 from jaxonomy_dae.library import signal
 from jaxonomy_dae.solvers import BDF, Rodas5P
 
@@ -151,6 +164,34 @@ def test_a_run_that_ends():
     assert solution.events.terminated == "bounced enough"
     np.testing.assert_array_equal(np.isfinite(solution["ball.h"]), EVENLY < BOUNCES[2])
     np.testing.assert_allclose(solution.events.ts[2:4], [BOUNCES[2]] * 2, atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flat", ["h**3", "h**3 + 1e-9*h"])
+def test_a_guard_that_meets_zero_flatly(flat):
+    """The ball with its floor written so: times, and the height by the restitution, in closed form."""
+
+    class FlatBall(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            e = self.parameter("e", 0.8)
+            h, v = self.variable("h", start=1.0, fixed=True), self.variable("v", start=0.0, fixed=True)
+            self.add_equations(Eq(der(h), v), Eq(der(v), -9.81))
+            self.when(sympy.sympify(flat, {"h": h}) <= 0, reinit(v, -e * pre(v)), reinit(h, 0))
+
+    system, falling = joined(FlatBall(EqnEnv(), "ball")), np.sqrt(2 / 9.81)
+
+    def run(e):
+        return simulate(system.with_parameters({"ball.e": e}), 2.0, ts=jnp.array([2.0]), **ROOM)
+
+    found = run(0.8)
+    np.testing.assert_allclose(found.events.ts[:3], falling * np.array([1.0, 2.6, 3.88]), rtol=1e-11)
+    # After three bounces: h = e³·w·s − 9.81/2·s², w = 9.81·falling, s = 2 − falling·(1 + 2·e + 2·e²).
+    e, w = 0.8, 9.81 * falling
+    s, by_e = 2 - falling * (1 + 2 * e + 2 * e**2), -falling * (2 + 4 * e)
+    np.testing.assert_allclose(found["ball.h"][0], e**3 * w * s - 9.81 / 2 * s**2, rtol=1e-10)
+    slope = jax.grad(lambda e: run(e)["ball.h"][0])(0.8)
+    np.testing.assert_allclose(slope, 3 * e**2 * w * s + (e**3 * w - 9.81 * s) * by_e, rtol=1e-9)
 
 
 def test_accumulation_is_named():
@@ -441,3 +482,34 @@ def test_a_relay_and_a_lag():
     found = found[found < 3.0]
     np.testing.assert_allclose(found, first + half * np.arange(len(found)), atol=1e-8)
     assert len(found) == 1 + int((3.0 - first) / half)
+
+
+class Sampler(Component):
+    """q takes g·u at each tick, s adds it up, and x' = q."""
+
+    def __init__(self, ev, name, period):
+        super().__init__(ev, name)
+        u, g = self.input("u"), self.parameter("g", 1.0)
+        q, s = self.discrete("q", start=0.0), self.discrete("s", start=0.0)
+        x = self.variable("x", start=0.0, fixed=True)
+        self.add_equations(Eq(der(x), q))
+        self.when(self.sampled(period), assign(q, g * u), assign(s, pre(s) + g * u))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("period", [0.1, 1.0])
+def test_a_record_and_a_clock_that_tick_together(period):
+    """The held sample at a tick is the new one, however the times of both are rounded; and so are its derivatives."""
+    system, end, n = joined(Sampler(EqnEnv(), "c", period)), 2.0, round(2.0 / period) + 3
+    values = np.random.default_rng(0).normal(size=n)
+    ticks = np.minimum(period * np.arange(n), end)
+    for times in (period * np.arange(n), np.cumsum([0.0, *[period] * (n - 1)]), np.linspace(0, period * (n - 1), n)):
+
+        def run(values, times=times):
+            given = {"c.u": (times, values, "held")}
+            solution = simulate(system, end, ts=jnp.array([end]), inputs=given)
+            return jnp.stack([solution["c.x"][0], solution["c.s"][0]])
+
+        weights = np.stack([np.diff(ticks, append=end), (period * np.arange(n) < end + 1e-9).astype(float)])
+        np.testing.assert_allclose(run(jnp.asarray(values)), weights @ values, atol=1e-6)
+        np.testing.assert_allclose(jax.jit(jax.jacrev(run))(jnp.asarray(values)), weights, atol=1e-6)

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+import sympy
 from problems import compiled
 from sympy import Eq
 
-from jaxonomy_dae import Component, EqnEnv, ModelError, der, simulate
+from jaxonomy_dae import Component, EqnEnv, ModelError, assign, der, simulate
 from jaxonomy_dae.host.cache import PROGRAMS
 from jaxonomy_dae.solvers import BDF, Rodas5P
 
@@ -239,6 +240,40 @@ def test_short_pulses_and_narrow_peaks_are_seen(sampled, name):
         np.testing.assert_array_equal(solution["held.y"], [0.0, 1.0, 1.0, 0.0])
 
 
+class Sampler(Component):
+    """x' = q, from 0, where q = u² and p = (1 for u > 0.25, else 0) are sampled every 0.1."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        u, x = self.input("u"), self.variable("x", start=0.0, fixed=True)
+        y, z = self.variable("y"), self.variable("z")
+        q, p = self.discrete("q", start=-1.0), self.discrete("p", start=-1.0)
+        self.add_equations(
+            Eq(der(x), q), Eq(y, u**2), Eq(z, sympy.Piecewise((1.0, u > 0.25), (0.0, True), evaluate=False))
+        )
+        self.when(self.sampled(0.1), assign(q, y), assign(p, z))
+
+
+@pytest.mark.slow
+def test_a_sample_at_a_tick_is_the_new_one():
+    """On whichever side of a tick its time is rounded, and in the branches that it chooses. Sums of squares."""
+    system, k = compiled(Sampler(EqnEnv(), "m")), np.arange(8)
+    even = 0.1 * k
+    ts = np.array([0.05, 0.15, 0.25, 0.35, 0.75])
+
+    def run(times, scale):
+        given = {"m.u": (jnp.asarray(times), scale * jnp.asarray(even), "held")}
+        return simulate(system, 0.75, ts=jnp.asarray(ts), inputs=given)
+
+    before = np.where(k > 0, np.nextafter(even, -1.0), 0.0)
+    for times in (even, np.nextafter(even, 9.0), before, np.cumsum(np.full(8, 0.1)) - 0.1):
+        found = run(times, 1.0)
+        np.testing.assert_allclose(found["m.q"], (0.1 * np.floor(10 * ts)) ** 2, rtol=1e-12)
+        np.testing.assert_array_equal(found["m.p"], [0.0, 0.0, 0.0, 1.0, 1.0])
+    slope = jax.grad(lambda scale: run(even, scale)["m.x"][-1])(1.0)
+    np.testing.assert_allclose(slope, 2 * (0.1 * np.sum(even[:7] ** 2) + 0.05 * even[7] ** 2), rtol=1e-10)
+
+
 @pytest.mark.slow
 def test_two_sampled_inputs():
     ev = EqnEnv()
@@ -336,7 +371,7 @@ class Wide(eqx.Module):
         (([0.0, np.inf], [0.0, 1.0]), r"'m\.u': times\[1\] is inf"),
         (([0.0, 10.0], np.ones((2, 2))), r"'m\.u': values must be real numbers of shape \(n,\)"),
         (([0.0, 10.0], np.ones(2) * 1j), r"'m\.u': values must be real numbers of shape \(n,\); got complex128"),
-        (([0.0, 10.0], np.ones(2), "quadratic"), r"samples are 'linear', 'cubic' or 'held'; got 'quadratic'"),
+        (([0.0, 10.0], np.ones(2), "quadratic"), r"samples are 'linear', 'spline', 'cubic' or 'held'; got 'quadratic'"),
         (([0.0, 9.0], np.ones(2)), r"samples of input 'm\.u' reach from 0 to 9, the run from 0 to 10"),
         (([1.0, 10.0], np.ones(2), "held"), r"reach from 1 to 10, the run from 0 to 10"),
         (
@@ -357,7 +392,7 @@ def test_inputs_that_cannot_be_read(lag, given, message):
 def test_unknown_inputs_and_wrong_tables(lag, rate):
     with pytest.raises(ModelError, match=r"'m\.v' is not an input of this system: did you mean 'm\.u'"):
         simulate(lag, 10.0, inputs={"m.v": 1.0})
-    with pytest.raises(ModelError, match=r"differentiates input 'm\.u' once: held samples.*Give 'cubic'"):
+    with pytest.raises(ModelError, match=r"differentiates input 'm\.u' once: held samples.*Give 'spline'"):
         simulate(rate, 1.0, inputs={"m.u": PULSE})
     for jumps, message in ((jnp.ones((2, 2)), r"shape \(2, 2\)"), (math.nan, "must be finite")):
         with pytest.raises(ModelError, match="jump_ts " + message if "finite" in message else message):

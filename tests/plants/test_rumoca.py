@@ -209,5 +209,5 @@ def test_a_model_runs_as_its_twin_in_base_modelica(model):
     theirs, ours = run(twin, ts), run(system, ts)
     values, others = ({n: v for n, v in s.parameters.items() if ":" not in n} for s in (system, twin))
     assert values == others
-    for name in twin.variables:
+    for name in (n for n in twin.variables if ":" not in n):  # those with a colon are the readers' own
         np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-7, atol=1e-7, err_msg=name)

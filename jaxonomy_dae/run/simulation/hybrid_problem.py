@@ -15,7 +15,7 @@ from ...solve.events.problem import AbstractHybridProblem
 from ...solve.methods.switching import Watch
 from ...write.events import EventFlag
 from ..start.after_event import with_blocks_solved
-from ..system.inputs import as_after
+from ..system.inputs import any_held, from_then_on
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .impulses import struck
@@ -57,7 +57,7 @@ class SystemProblem(AbstractHybridProblem):
         return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
     def at_instant(self, args):
-        return as_after(args, self.resolution)
+        return (from_then_on(args, self.resolution), any_held(args)) if args else (args, False)
 
     def written(self, t, x, read, q, previous, events, args):
         plan = self.events

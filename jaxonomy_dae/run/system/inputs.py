@@ -23,9 +23,11 @@ from ...compile.model.array_names import regular_shape, wrong_shape
 from ...host.staging import as_array, is_traced, on_device
 from ...write.networks import uses_numpy, why_untraceable
 from .closed_function import ClosedFunction, closed_function
+from .splines import natural_spline
 
-KINDS = ("linear", "cubic", "held")
-EXAMPLE = "inputs={'m.u': (times, values)}, or (times, values, 'held') or 'cubic'"
+KINDS = ("linear", "spline", "cubic", "held")
+CURVED = ("spline", "cubic")  # whose slopes follow from several samples
+EXAMPLE = "inputs={'m.u': (times, values)}, or (times, values, 'held') or 'spline'"
 
 
 class HeldPath(eqx.Module):
@@ -41,7 +43,7 @@ class HeldPath(eqx.Module):
 
 class SampledInput(eqx.Module):
     """An interpolated input. Its derivatives up to order `smoothness` are continuous: 0 for linear interpolation, 1 for
-    cubic, −1 for samples that are held."""
+    causal cubic curves, 2 for splines, −1 for samples that are held."""
 
     path: Any
     smoothness: int = eqx.field(static=True)
@@ -50,14 +52,27 @@ class SampledInput(eqx.Module):
         return self.path.evaluate(t)
 
 
-def as_after(inputs: Any, within: Any) -> Any:
-    """Inputs whose held samples count from a little earlier, by the time `within`: at an instant, the new one is read
-    whatever rounding says of its time."""
+def any_held(inputs: Mapping[str, Any]) -> bool:
+    """True if there are samples that are held."""
+    return any(isinstance(source, SampledInput) and source.smoothness < 0 for source in map(_whole, inputs.values()))
 
-    def earlier(path: Any) -> Any:
-        return HeldPath(path.ts - jax.lax.stop_gradient(within), path.ys) if isinstance(path, HeldPath) else path
 
-    return jax.tree.map(earlier, inputs, is_leaf=lambda leaf: isinstance(leaf, HeldPath))
+def _whole(source: Any) -> Any:
+    return source.source if isinstance(source, Entry) else source
+
+
+def from_then_on(inputs: Mapping[str, Any], resolution: Any) -> dict[str, Any]:
+    """Inputs as what happens at an instant reads them: a sample that is held from that instant on is the new one, on
+    whichever side of it rounding has put the sample's time. Times closer than the `resolution` are one instant."""
+
+    def read(source: Any) -> Any:
+        if isinstance(source, Entry):
+            return Entry(read(source.source), source.index)
+        if isinstance(source, SampledInput) and isinstance(source.path, HeldPath):
+            return SampledInput(HeldPath(source.path.ts - resolution, source.path.ys), source.smoothness)
+        return source
+
+    return {name: read(source) for name, source in inputs.items()}
 
 
 class Entry(eqx.Module):
@@ -193,7 +208,7 @@ def _function(name: str, function: Callable[[Any], Any], dtype: Any, allowed: tu
 def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: tuple[int, ...]) -> SampledInput:
     kind = given[2] if len(given) == 3 else "linear"
     if kind not in KINDS:
-        raise ModelError(f"input '{name}': samples are 'linear', 'cubic' or 'held'; got {kind!r}")
+        raise ModelError(f"input '{name}': samples are 'linear', 'spline', 'cubic' or 'held'; got {kind!r}")
     times = _column(name, "times", given[0], dtype)
     for_each = shape and len(regular_shape(given[1]) or ()) > 1
     values = _column(name, "values", given[1], dtype, shape if for_each else ())
@@ -209,6 +224,8 @@ def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: t
         return SampledInput(HeldPath(times, values), -1)
     if kind == "linear":
         return SampledInput(diffrax.LinearInterpolation(times, values), 0)
+    if kind == "spline":
+        return SampledInput(natural_spline(times, values), 2)
     return SampledInput(diffrax.CubicInterpolation(times, diffrax.backward_hermite_coefficients(times, values)), 1)
 
 
@@ -321,8 +338,8 @@ def step_ends(plan: SystemPlan, inputs: Mapping[str, Any]) -> StepEnds:
         places = plan.input_places(name)
         highest = 0 if places is None else plan.inputs.highest(places)
         if highest > value.smoothness + 1:
-            kind = {-1: "held", 0: "linear", 1: "cubic"}[value.smoothness]
-            better = "'cubic'" if highest <= 2 else "a smooth function of time"
+            kind = {-1: "held", 0: "linear", 1: "cubic", 2: "spline"}[value.smoothness]
+            better = "'spline'" if highest <= 3 else "a smooth function of time"
             raise ModelError(
                 f"the model differentiates input '{name}' {_times(highest)}: {kind} samples do not have that "
                 f"derivative at their times. Give {better}"

@@ -7,7 +7,7 @@ rounding; its derivative is that of the time of the crossing, by the implicit fu
 
 has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its derivative (Aizerman & Gantmacher 1958). Its
 second derivative is not that of the flow, and is refused. A clock ticks at τ = offset + k·period, a function of
-parameters, in the same manner. What is held from one sample to the next is read at an instant as it is after it.
+parameters, in the same manner.
 """
 
 import math
@@ -22,12 +22,13 @@ from jax import Array, lax
 from ...base.aliases import Args, Time
 from ...write.events import EventFlag
 from ..adjoint.closure_conversion import any_member
+from ..adjoint.resting import still
 from .after_event import aftermath
 from .instant import Arrival, Happening, Instant, is_zero
 from .log import EventRows
 from .problem import AbstractHybridProblem, HybridState, one_hot
 from .rivals import Rivals
-from .side import BELOW, RESTS
+from .side import BELOW, RESTS, rounding
 
 CONDITIONS_AT_ONE_INSTANT = 32  # if more events are due, the rest happen in another step, which is as good as none
 # How often guards may fall while time does not go on, beside so often for each. Beyond, relations turn back and forth,
@@ -52,9 +53,13 @@ def handle(
 
     At the initial time, `at_start`, events do not move with parameters, and are logged only if they end the run.
     """
+    args, may_jump = problem.at_instant(args)
+    first = arrival.due
+    if may_jump and problem.facts.n_guards and not at_start:
+        arrival, first = _with_jumps(problem, t, state, arrival, args)
     events = _Events.of(problem, t, state, arrival, args, at_start)
     start = Instant(
-        state=state, left=arrival.due, caused=arrival.jumped, delay=jnp.zeros_like(t), round=arrival.due,
+        state=state, left=arrival.due, caused=arrival.jumped, delay=jnp.zeros_like(t), round=first,
         before=state.x, approach=arrival.slope, previous=state.q, slope=arrival.slope, arrived=state.x,
         stuck=jnp.zeros((problem.facts.n_guards,), bool), noted=noted, wrote=events.rivals.nobody,
     )  # fmt: skip
@@ -67,6 +72,24 @@ def handle(
         handled = _while_any_is_left(handled, -(-length // inner))
     instant = handled(start)
     return instant.state, instant.slope, instant.noted
+
+
+def _with_jumps(
+    problem: AbstractHybridProblem, t: Time, state: HybridState, arrival: Arrival, args: Args
+) -> tuple[Arrival, Array]:
+    """Returns (the arrival with the guards that fall because what the equations read jumps at this instant, the events
+    of the first round). Relations that turn by the jump turn before all else: other events read equations of one
+    time."""
+    c = problem.facts.n_clocks
+    problem, *point = still((problem, t, state.x, state.q, args))
+    value = problem.guards(*point)
+    size = jnp.maximum(arrival.size, jnp.abs(value))
+    falls = (state.armed != BELOW) & (value < -rounding(size)) & ~arrival.due[c:]
+    of_clocks = jnp.zeros((c,), bool)
+    due = arrival.due | jnp.concatenate([of_clocks, falls])
+    turned = jnp.concatenate([of_clocks, falls]) & problem.facts.are(EventFlag.RELATION)
+    first = jnp.where(jnp.any(turned), turned, due)
+    return arrival._replace(due=due, jumped=arrival.jumped | falls, size=size), first
 
 
 class _Events(NamedTuple):
@@ -122,7 +145,8 @@ class _Events(NamedTuple):
         )
         now = self._happening(instant, jnp.where(jnp.any(together), jnp.argmax(together), c + g))
         event, delay = now.event, now.delay
-        time, reached = t + delay, state.x + instant.slope * delay
+        # A step may end a rounding error off the tick: what equations read at a tick, they read at its own time.
+        time, reached = jnp.where(now.is_clock, now.tick, t + delay), state.x + instant.slope * delay
         x, written = problem.written(time, reached, base + base_slope * delay, q, previous, now.these, args)
         now = now._replace(moved=jnp.any(x != reached) & ~self.relations[event])
         after = aftermath(problem, t, x, written, instant, arrival, now, args)
@@ -172,13 +196,13 @@ class _Events(NamedTuple):
         is_clock = event < c
         delay, rates = jnp.zeros_like(self.t), self.arrival.rate
         rose = onto = jnp.zeros((g,), bool)
+        tick = self.t
         if g and not self.at_start:
             crossing, rates, rose, onto = _crossing(self, instant, event)
             delay = jnp.where(is_clock, delay, crossing)
         if c and not self.at_start:
-            exact = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
-            late = jnp.clip(lax.stop_gradient(exact) - self.t, 0, problem.resolution)  # a step ends up to rounding
-            delay = jnp.where(is_clock, exact - lax.stop_gradient(exact) + late, delay)
+            tick = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
+            delay = jnp.where(is_clock, tick - lax.stop_gradient(tick), delay)
         # Parts that strike at the same instant do so at once, whatever the order: a box that falls flat does not turn.
         # All share the δ of the first: if a parameter parts their instants, the derivative is one-sided, as at any
         # kink.
@@ -186,7 +210,7 @@ class _Events(NamedTuple):
         if self.several:
             these = these | (instant.left & self.strikes & self.strikes[event])
         return Happening(
-            event=event, is_clock=is_clock, these=these, delay=delay, rates=rates, moved=np.False_,
+            event=event, is_clock=is_clock, tick=tick, these=these, delay=delay, rates=rates, moved=np.False_,
             approach=jnp.where(instant.caused | self.at_start, 0.0, rates), rose=rose, onto=onto, waits=self.waits,
         )  # fmt: skip
 

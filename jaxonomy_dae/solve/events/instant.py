@@ -72,7 +72,8 @@ class Arrival(NamedTuple):
 class Happening(NamedTuple):
     """What happens now, as one: an event, or several that strike together.
 
-    - `event`: the number of the first of them; `is_clock`: whether that is one of a clock.
+    - `event`: the number of the first of them; `is_clock`: whether that is one of a clock, `tick`: its
+        time then, which moves with parameters.
     - `these`: all of them, shape (clocks + guards,).
     - `delay`: δ of the first (second).
     - `moved`: whether they wrote states.
@@ -83,6 +84,7 @@ class Happening(NamedTuple):
 
     event: Array
     is_clock: Array
+    tick: Time
     these: Array
     delay: Time
     rates: Array

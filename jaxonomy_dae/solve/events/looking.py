@@ -53,6 +53,12 @@ def _between(place: Array, values: Array) -> Array:
     return weights @ values / jnp.sum(weights)
 
 
+def _apart(n: int) -> np.ndarray:
+    """Factors from 1 to 2, no two of them alike: by these, errors of states that are equal do not cancel. They are
+    multiples of the golden ratio, which are the farthest apart (Knuth, volume 3, section 6.4)."""
+    return 1.0 + np.arange(n) * (0.5 * (np.sqrt(5.0) - 1.0)) % 1.0
+
+
 class _Step(NamedTuple):
     """The step from y0 at t0 to x1 at t1, whose states are `dense(t0, t1, t)`; not differentiated."""
 
@@ -151,29 +157,37 @@ def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> M
     crossed = armed[:-1] & (below | stays)
     last = values[-1]
 
-    def reaches_zero(rate):
-        # A step that was shortened to end at zero does so up to the rounding of the terms of the guard.
-        rounded = jnp.minimum(band, -rate * (AHEAD * span))
-        return (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, rounded))
+    def reaches_zero(rate, doubt):
+        # A step that was shortened to end at zero does so up to rounding.
+        return (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, jnp.minimum(doubt, -rate * (AHEAD * span))))
 
     def at_end():
         before = problem.slope(t1, x1, q, args)
-        return before, reaches_zero(problem.rates(t1, x1, q, args, before)[1])
+        # How much of a guard is rounding in the states: little, where it meets zero flatly, whatever its values were.
+        along = jnp.stack([before, jnp.asarray(_apart(len(x1)), x1.dtype) * x1])
+        rate, by_rounding = jax.vmap(lambda direction: problem.rates(t1, x1, q, args, direction)[1])(along)
+        return before, reaches_zero(rate, rounding(jnp.abs(by_rounding)))
 
     # A step so short that points inside cannot be distinguished from its ends.
     short = h <= 4 * problem.resolution
     if problem.facts.only_kinks:
-        before, near = jnp.zeros_like(x1), reaches_zero(jnp.asarray(_RATE_AT_END, values.dtype) @ values / h)
+        before, near = jnp.zeros_like(x1), reaches_zero(jnp.asarray(_RATE_AT_END, values.dtype) @ values / h, band)
     else:
         doubtful = jnp.any(armed[-1] & (last <= CLOSE * size)) | jnp.any(ticking) | short
         before, near = lax.cond(any_member(doubtful), at_end, lambda: (jnp.zeros_like(x1), jnp.zeros((g,), bool)))
     near = near & armed[-1]
-    bent = jnp.any(off > jnp.maximum(BEND * size, band))
+    # One that falls or rises from look to look crosses zero once, however it bends: where it does so flatly, as h³, the
+    # halves would bend as much, without end. The polynomial through the looks is not good enough for it.
+    monotone = jnp.all(rise < 0, axis=0) | jnp.all(rise > 0, axis=0)
+    bent = (off > jnp.maximum(BEND * size, band)) & (problem.facts.only_kinks | ~monotone)
+    bent = jnp.any(bent)
     long = h > 1e3 * jnp.maximum(WINDOW * h, problem.resolution)
     bent = bent & long
-    # In a step too short to be split, a guard that crossed zero has jumped.
-    jumped = jnp.any(crossed, axis=0) & ~near & short
-    near = near | jumped
+    # In a step too short to be split, a guard that crossed zero has jumped, unless rounding alone could take it there:
+    # where it meets zero flatly, its sign is that of its rounding errors.
+    falls = jnp.any(crossed, axis=0) & ~near & short
+    jumped = falls & (size > band)
+    near = near | falls
     within = jnp.any(crossed[:-1], axis=0) & ~short
     inside = jnp.any(within | (crossed[-1] & ~near))
 
@@ -204,7 +218,11 @@ def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> M
 def _dip(values, armed, crossed, doubt):
     """The place (a fraction of the step) where a guard that is positive at all looks has the minimum of the parabola
     through its values at both ends and in the middle, if that minimum is below `doubt`; infinity otherwise. The caller
-    ends the step there and looks again, until the minimum is decided."""
+    ends the step there and looks again, until the minimum is decided.
+
+    A guard that falls at the end of the step and from look to look has no minimum inside, whatever the parabola says:
+    it has one in a later step.
+    """
     left, middle, right = values[jnp.array(FITTED)]
     bend = 2 * (left - 2 * middle + right)
     slope = 4 * middle - 3 * left - right
@@ -214,5 +232,7 @@ def _dip(values, armed, crossed, doubt):
     before = jnp.sum(jnp.asarray(LOOKS, values.dtype)[:, None] <= place, axis=0) - 1
     was_armed = jnp.take_along_axis(armed, jnp.clip(before, 0, len(LOOKS) - 1)[None], axis=0)[0]
     lowest = left + 0.5 * slope * place
-    dips = curved & was_armed & ~crossed & (1e-3 < place) & (place < 1) & (lowest < doubt)
+    rate_at_end = jnp.asarray(_RATE_AT_END, values.dtype) @ values
+    turns = jnp.any(values[1:] >= values[:-1], axis=0) | (rate_at_end > 0)
+    dips = curved & turns & was_armed & ~crossed & (1e-3 < place) & (place < 1) & (lowest < doubt)
     return jnp.min(jnp.where(dips, place, jnp.inf))

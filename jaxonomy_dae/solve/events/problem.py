@@ -68,9 +68,10 @@ class AbstractHybridProblem(eqx.Module):
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
         """Periods and offsets of the sampled events; the period is infinite for one that happens once."""
 
-    def at_instant(self, args: Args) -> Args:
-        """Arguments as the events of an instant read them: what jumps there has jumped, whatever rounding says."""
-        return args
+    def at_instant(self, args: Args) -> tuple[Args, bool]:
+        """Returns (what the equations read at an instant and from then on, whether that may differ from what they read
+        just before)."""
+        return args, False
 
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
         """The time of the next tick of each clock, given the number of ticks so far."""
