@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool
 
 from ...base.aliases import Controller, Inputs, PyTree, Result, Solver, Time, Times
 from ...base.errors import ModelError
+from ...base.tolerances import RESOLUTION
 from ...solve.adjoint.resting import still
 from ...solve.methods.solve_arguments import check_finite, check_longest_step
 from ..start.initial_values import check_initial
@@ -99,7 +100,7 @@ def check_start(system: AcausalSystem, t0: Time, t1: Time, ts: Times, initial: P
         check_array(system, initial)
     else:
         check_initial(system, initial)
-    _check_interval(initial_time(t0, initial), t1, ts)
+    _check_interval(initial_time(t0, initial), t1, ts, system.parameters.values.dtype)
     _check_periods(system)
 
 
@@ -150,11 +151,25 @@ def _concrete(value: object) -> np.ndarray | None:
     return None if isinstance(value, Tracer) else np.asarray(value, float)
 
 
-def _check_interval(t0, t1, ts):
+def _check_length(t0: float, t1: float, dtype: np.dtype) -> None:
+    """Raises a `ModelError` if numbers of this type hardly tell the times of a run apart."""
+    largest = max(abs(t0), abs(t1))
+    if t1 - t0 > RESOLUTION * float(np.finfo(dtype).eps) * largest:
+        return
+    double = 'use double precision, jax.config.update("jax_enable_x64", True), or ' if dtype == np.float32 else ""
+    raise ModelError(
+        f"the interval from t0={t0!r} to t1={t1!r} is too short for {dtype.name}, in which times near {largest:g} are "
+        f"{float(np.spacing(dtype.type(largest))):g} s apart: {double}count time from the start, t0=0.0"
+    )
+
+
+def _check_interval(t0, t1, ts, dtype):
     check_finite(t0=t0, t1=t1)
     a, b = _concrete(t0), _concrete(t1)
     if a is not None and b is not None and not a < b:
         raise ModelError(f"the interval needs t0 < t1; got t0={float(a)}, t1={float(b)}")
+    if a is not None and b is not None:
+        _check_length(float(a), float(b), np.dtype(dtype))
     if ts is None:
         return
     if np.ndim(ts) != 1 or not np.shape(ts)[0]:
