@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ...base.tolerances import NOISE, spacing
-from ...solve.linear.arrays import Numbers, loop, namespace, where
+from ...base.tolerances import NOISE, ridge, spacing
+from ...solve.linear.arrays import Numbers, loop, namespace, triangular, where
 from .search import Look
 
 ROUNDS = 3  # of steps onto the starts alone: these are linear in the unknowns, or nearly so
@@ -116,7 +116,10 @@ def guessed_point(
 
 
 def _least_squares(xp, matrix: Numbers, right: Numbers) -> Numbers:
-    """The shortest least-squares solution; zeros where the matrix is not finite."""
+    """A least-squares solution, next to the shortest one; zeros where the matrix is not finite. By QR: what is written
+    in C has no decomposition by singular values."""
     finite = xp.all(xp.isfinite(matrix)) & xp.all(xp.isfinite(right))
     matrix, right = xp.where(finite, matrix, 0), xp.where(finite, right, 0)
-    return xp.linalg.lstsq(matrix, right, rcond=None)[0]
+    m, n = matrix.shape
+    q, r = xp.linalg.qr(xp.concatenate([matrix, ridge(matrix.dtype) * xp.eye(n, dtype=matrix.dtype)]))
+    return triangular(r, (q[:m].T @ right)[:, None])[:, 0]
