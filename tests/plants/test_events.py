@@ -22,7 +22,18 @@ from hybrid_references import BOUNCES, HEIGHT, SIXTH_BY_E, SLOPES, commensurate_
 from problems import compiled as joined
 from sympy import Eq
 
-from jaxonomy_dae import AcausalSystem, Component, EqnEnv, ModelError, SimulationError, der, pre, reinit, simulate
+from jaxonomy_dae import (
+    AcausalSystem,
+    Component,
+    EqnEnv,
+    ModelError,
+    SimulationError,
+    assign,
+    der,
+    pre,
+    reinit,
+    simulate,
+)
 from jaxonomy_dae.library import signal
 from jaxonomy_dae.solvers import BDF, Rodas5P
 
@@ -181,6 +192,27 @@ def test_a_guard_that_meets_zero_flatly(flat):
     np.testing.assert_allclose(found["ball.h"][0], e**3 * w * s - 9.81 / 2 * s**2, rtol=1e-10)
     slope = jax.grad(lambda e: run(e)["ball.h"][0])(0.8)
     np.testing.assert_allclose(slope, 3 * e**2 * w * s + (e**3 * w - 9.81 * s) * by_e, rtol=1e-9)
+
+
+class Onto(Component):
+    """An event sets states from 5 to exactly 2, from where they rest, rise and fall; `n` and `strictly` count."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        for rate in (0, 1, -1):
+            y, on = self.variable(f"y[{rate}]", start=5.0, fixed=True), self.discrete(f"on[{rate}]", start=0)
+            n, strictly = self.discrete(f"n[{rate}]", start=0), self.discrete(f"strictly[{rate}]", start=0)
+            self.add_equations(Eq(der(y), rate * on))
+            self.when(ev.t >= 0.5, reinit(y, 2.0), assign(on, 1))
+            self.when(y <= 2.0, assign(n, pre(n) + 1))
+            self.when(y < 2.0, assign(strictly, pre(strictly) + 1))
+
+
+@pytest.mark.slow
+def test_what_is_set_onto_a_level():
+    found = simulate(joined(Onto(EqnEnv(), "m")), 1.0, ts=jnp.array([1.0]))
+    assert [float(found[f"m.n[{rate}]"][0]) for rate in (0, 1, -1)] == [1, 1, 1]
+    assert [float(found[f"m.strictly[{rate}]"][0]) for rate in (0, 1, -1)] == [0, 0, 1]
 
 
 def test_accumulation_is_named():

@@ -165,6 +165,8 @@ def _sides(
     # conditions wait until they leave zero: modes of a system at rest would turn for ever.
     equal = zero & (rate == 0) & (armed == ABOVE) & ~here & problem.facts.true_at_zero
     equal = equal & (relations[c:] | jnp.asarray(relations)[event])
+    # What an event sets exactly onto a level, from clearly above it, is there, wherever it goes then.
+    equal = equal | ((value == 0) & (armed == ABOVE) & ~here & ~reached & problem.facts.true_at_zero & ~relations[c:])
     stays = (left[c:] & now.onto & (value == 0)) | equal
     true = jnp.where(zero, ((falling * arrival.span < -band) & ~now.waits) | stays, value < 0)
     was_armed = ((armed > 0) & ~here) | (turns_back & (event >= c)) | (now.rose & ~here)
