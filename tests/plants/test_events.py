@@ -199,9 +199,9 @@ class Onto(Component):
 
     def __init__(self, ev, name):
         super().__init__(ev, name)
-        for rate in (0, 1, -1):
-            y, on = self.variable(f"y[{rate}]", start=5.0, fixed=True), self.discrete(f"on[{rate}]", start=0)
-            n, strictly = self.discrete(f"n[{rate}]", start=0), self.discrete(f"strictly[{rate}]", start=0)
+        for then, rate in {"rests": 0, "rises": 1, "falls": -1}.items():
+            y, on = self.variable(f"y_{then}", start=5.0, fixed=True), self.discrete(f"on_{then}", start=0)
+            n, strictly = self.discrete(f"n_{then}", start=0), self.discrete(f"strictly_{then}", start=0)
             self.add_equations(Eq(der(y), rate * on))
             self.when(ev.t >= 0.5, reinit(y, 2.0), assign(on, 1))
             self.when(y <= 2.0, assign(n, pre(n) + 1))
@@ -211,8 +211,8 @@ class Onto(Component):
 @pytest.mark.slow
 def test_what_is_set_onto_a_level():
     found = simulate(joined(Onto(EqnEnv(), "m")), 1.0, ts=jnp.array([1.0]))
-    assert [float(found[f"m.n[{rate}]"][0]) for rate in (0, 1, -1)] == [1, 1, 1]
-    assert [float(found[f"m.strictly[{rate}]"][0]) for rate in (0, 1, -1)] == [0, 0, 1]
+    counts = {then: (found[f"m.n_{then}"][0], found[f"m.strictly_{then}"][0]) for then in ("rests", "rises", "falls")}
+    assert counts == {"rests": (1, 0), "rises": (1, 0), "falls": (1, 1)}
 
 
 def test_accumulation_is_named():
