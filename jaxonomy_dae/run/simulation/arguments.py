@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool
 
 from ...base.aliases import Controller, Inputs, PyTree, Result, Solver, Time, Times
 from ...base.errors import ModelError
+from ...base.tolerances import RESOLUTION
 from ...solve.adjoint.resting import still
 from ...solve.methods.solve_arguments import check_finite, check_longest_step
 from ..start.initial_values import check_initial
@@ -99,7 +100,7 @@ def check_start(system: AcausalSystem, t0: Time, t1: Time, ts: Times, initial: P
         check_array(system, initial)
     else:
         check_initial(system, initial)
-    _check_interval(initial_time(t0, initial), t1, ts)
+    _check_interval(initial_time(t0, initial), t1, ts, system.parameters.values.dtype)
     _check_periods(system)
 
 
@@ -150,11 +151,19 @@ def _concrete(value: object) -> np.ndarray | None:
     return None if isinstance(value, Tracer) else np.asarray(value, float)
 
 
-def _check_interval(t0, t1, ts):
+def _check_interval(t0, t1, ts, dtype):
     check_finite(t0=t0, t1=t1)
     a, b = _concrete(t0), _concrete(t1)
     if a is not None and b is not None and not a < b:
         raise ModelError(f"the interval needs t0 < t1; got t0={float(a)}, t1={float(b)}")
+    if a is not None and b is not None:
+        spacing = float(np.finfo(dtype).eps * max(abs(a), abs(b)))
+        if b - a < RESOLUTION * spacing:
+            double = ', or use double precision: jax.config.update("jax_enable_x64", True)' if dtype == np.float32 else ""
+            raise ModelError(
+                f"times near {float(b):g} are {spacing:.2g} apart in {dtype}: a run from t0={float(a)} to t1={float(b)} "
+                f"has too few of them to step through. Count time from the beginning of the run, t0=0.0{double}"
+            )
     if ts is None:
         return
     if np.ndim(ts) != 1 or not np.shape(ts)[0]:
