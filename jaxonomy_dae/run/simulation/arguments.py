@@ -159,10 +159,12 @@ def _check_interval(t0, t1, ts, dtype):
     if a is not None and b is not None:
         spacing = float(np.finfo(dtype).eps * max(abs(a), abs(b)))
         if b - a < RESOLUTION * spacing:
-            double = ', or use double precision: jax.config.update("jax_enable_x64", True)' if dtype == np.float32 else ""
+            is_single = dtype == np.float32
+            double = ', or use double precision: jax.config.update("jax_enable_x64", True)' if is_single else ""
             raise ModelError(
-                f"times near {float(b):g} are {spacing:.2g} apart in {dtype}: a run from t0={float(a)} to t1={float(b)} "
-                f"has too few of them to step through. Count time from the beginning of the run, t0=0.0{double}"
+                f"times near {float(b):g} are {spacing:.2g} apart in {dtype}: a run from t0={float(a)} to "
+                f"t1={float(b)} has too few of them to step through. Count time from the beginning of the run, "
+                f"t0=0.0{double}"
             )
     if ts is None:
         return
