@@ -77,17 +77,18 @@ def peak(squares: Float[np.ndarray, " m"]) -> float:
     return min(len(squares) * (1 - share) ** (len(squares) - 1), 1.0)
 
 
-def log_likelihood(m: Minimum) -> float:
+def log_likelihood(objective: Objective, m: Minimum) -> float:
     """As `Estimate.log_likelihood`."""
     cost = m.weights.cost(m.z, m.found.residual) - m.weights.prior_cost(m.z)
-    return m.weights.log_rows - cost - 0.5 * m.weights.samples * float(np.log(2 * np.pi))
+    scale = objective.colour.log_scale(m.weights.share)
+    return m.weights.log_rows - cost - scale - 0.5 * m.weights.samples * float(np.log(2 * np.pi))
 
 
 def rms_by_name(objective: Objective, m: Minimum, point: Float[np.ndarray, " p"]) -> dict[str, dict[str, float]]:
     """As `Estimate.rms`."""
     s, rows = objective.stacked, objective.rows
     errors = np.full(s.values.shape, np.nan)
-    errors[rows] = m.found.residual
+    errors[rows] = objective.colour.coloured(m.found.residual)
     if not np.isin(np.arange(len(s.labels)), rows[0]).all():
         free_runs = objective.outputs(point) - s.values
         errors = np.where(np.isnan(errors), free_runs, errors)

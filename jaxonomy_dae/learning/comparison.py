@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.errors import ModelError, nearest, whole_number
+from ..base.errors import ModelError, explained_keywords, nearest, whole_number
 from .data import Data
 from .estimate import Estimate
 from .problem import Problem
@@ -127,6 +127,7 @@ class Comparison:
         return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
 
 
+@explained_keywords()
 def compare(fits: Mapping[str, Estimate]) -> Comparison:
     """Compares fits of several models to the same data, by Schwarz's criterion with the effective number of
     coordinates, and by held-out experiments. A difference above 6 is strong evidence, and a difference below 2 is

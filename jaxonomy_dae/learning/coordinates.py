@@ -165,7 +165,7 @@ class Coordinates:
                 outside = (value < self.low[chosen]) | (value > self.high[chosen])
                 if outside.any():
                     low, high = self.low[chosen][0], self.high[chosen][0]
-                    raise ModelError(f"'{name}' must lie in [{low:g}, {high:g}]; got {value:g}")
+                    raise ModelError(f"'{name}' must lie in [{end_text(low)}, {end_text(high)}]; got {value:g}")
                 start[chosen] = value
             if fixed:
                 held |= chosen
@@ -182,8 +182,8 @@ class Coordinates:
                 raise ModelError(f"bounds of '{name}' are a pair (low, high); got {given!r}") from None
             if not new_low <= new_high or new_low < low[chosen].min() or new_high > high[chosen].max():
                 raise ModelError(
-                    f"bounds of '{name}' must lie within those declared, [{low[chosen].min():g}, "
-                    f"{high[chosen].max():g}]; got [{new_low:g}, {new_high:g}]"
+                    f"bounds of '{name}' must lie within those declared, "
+                    f"[{end_text(low[chosen].min())}, {end_text(high[chosen].max())}]; got [{new_low:g}, {new_high:g}]"
                 )
             low[chosen], high[chosen] = new_low, new_high
         return dataclasses.replace(self, low=low, high=high)
@@ -259,6 +259,11 @@ def coordinates(
     ).with_priors(priors)  # fmt: skip
 
 
+def end_text(end: float) -> str:
+    """A bound as it was declared: an open end at zero stands in coordinates as the least number beside it."""
+    return "0" if abs(end) < np.finfo(float).tiny else f"{end:g}"
+
+
 def is_positive(interval: Interval) -> bool:
     """True if all values are above zero, so that a logarithmic scale can be used. Zero itself, where it is admissible,
     is infinitely far away on it."""
@@ -287,7 +292,9 @@ def _start(label: str, units: dict[str, str], name: str, given: float | Unknown,
     known = not isinstance(given, Unknown)
     guess = float(given.guess if isinstance(given, Unknown) else given)
     if not low <= guess <= high:
-        raise ModelError(f"{label}: the guess must lie in [{low:g}, {high:g}], as '{name}' does; got {guess:g}")
+        raise ModelError(
+            f"{label}: the guess must lie in [{end_text(low)}, {end_text(high)}], as '{name}' does; got {guess:g}"
+        )
     spread = float(given.spread) if isinstance(given, Unknown) and given.spread is not None else math.inf
     size = 1.0 if log else spread if math.isfinite(spread) else abs(guess) or 1.0
     spread /= guess if log else size

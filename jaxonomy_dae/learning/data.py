@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.interpolate import CubicSpline
 
 from ..base.errors import ModelError, nearest
 from ..compile.lowering.plan import SystemPlan
@@ -80,6 +81,7 @@ class Stacked:
     unit: Float[np.ndarray, "e n k"]  # by which a level that is estimated is multiplied
     level_of: tuple[str, ...]  # the name of each output's level: its own, or one that outputs share
     tails: Float[np.ndarray, "k 2"]  # of each output's noise: degrees of freedom, and knee
+    rho: Float[np.ndarray, " k"]  # the correlation of neighbouring errors; 0: white, NaN: to be estimated
     weight: Float[np.ndarray, " e"]
     holdout: Bool[np.ndarray, " e"]
     inputs: dict[str, tuple[Float[np.ndarray, "e m"], Float[np.ndarray, "e m"]]]
@@ -113,6 +115,7 @@ class Stacked:
     def check_plain(self, what: str) -> None:
         """Refuses noise that is not normal, or has a level that outputs share, with a `ModelError`; `what` does not
         take it."""
+        self.check_white(what)
         bent = np.flatnonzero(np.isfinite(self.tails).any(axis=1))
         shared = [name for name, level in zip(self.outputs, self.level_of, strict=True) if level != name]
         if len(bent) or shared:
@@ -120,6 +123,15 @@ class Stacked:
             kind = "has tails" if len(bent) else "shares its level"
             raise ModelError(
                 f"the noise of '{name}' {kind}, which {what} does not take: use method='single', or leave it out"
+            )
+
+    def check_white(self, what: str) -> None:
+        """Refuses noise that is correlated, with a `ModelError`; `what` does not take it."""
+        coloured = np.flatnonzero(self.rho != 0)
+        if len(coloured):
+            raise ModelError(
+                f"the noise of '{self.outputs[coloured[0]]}' is correlated, rho, which {what} does not take: use "
+                "fit() with method='single', or leave it out"
             )
 
     def until(self, share: float) -> "Stacked":
@@ -147,8 +159,10 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mappin
         outputs |= dict.fromkeys(column)
         for name, own in noise.items():
             first = noises.setdefault(name, own)
-            if (own.shared, own.tails) != (first.shared, first.tails):
-                raise ModelError(f"{label}: the noise of '{name}' has another distribution or shared level than before")
+            if (own.shared, own.tails, own.rho) != (first.shared, first.tails, first.rho):
+                raise ModelError(
+                    f"{label}: the noise of '{name}' has another distribution, correlation or shared level than before"
+                )
     n = max(len(one.times) for one in experiments)
     shape = (len(experiments), n, len(outputs))
     values, levels, unit = np.full(shape, math.nan), np.full(shape, math.nan), np.ones(shape)
@@ -176,6 +190,7 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mappin
         unit=unit,
         level_of=tuple(noises[name].shared or name for name in outputs),
         tails=np.array([noises[name].tails for name in outputs]),
+        rho=np.array([noises[name].correlation for name in outputs]),
         weight=np.array([one.weight for one in experiments], float),
         holdout=~training,
         inputs=inputs,
@@ -251,8 +266,12 @@ def _inputs(
             given.append((times, values))
         m = max(len(times) for times, _ in given)
         padded = [_beyond(times, m) for times, _ in given]
-        found[name] = np.stack(padded), np.stack([_padded(values, m) for _, values in given])
-        kinds.append((name, kind or "held"))
+        kind = kind or "held"
+        found[name] = (
+            np.stack(padded),
+            np.stack([_continued(*one, at, kind) for one, at in zip(given, padded, strict=True)]),
+        )
+        kinds.append((name, kind))
     return found, tuple(kinds)
 
 
@@ -268,7 +287,7 @@ def _samples(name: str, source: object, one: Experiment, label: str) -> tuple[np
         )
     kind = source[2] if len(source) == 3 else "linear"
     if kind not in KINDS:
-        raise ModelError(f"{label}: input '{name}': samples are 'linear', 'cubic' or 'held'; got {kind!r}")
+        raise ModelError(f"{label}: input '{name}': samples are 'linear', 'spline', 'cubic' or 'held'; got {kind!r}")
     times, values = np.asarray(source[0], float), np.asarray(source[1], float)
     if times.ndim != 1 or times.shape != values.shape or len(times) < 2:
         raise ModelError(
@@ -293,6 +312,15 @@ def _beyond(times: np.ndarray, m: int) -> np.ndarray:
     """Times continued to m of them, in steps like the last."""
     step = times[-1] - times[-2]
     return np.concatenate([times, times[-1] + step * np.arange(1, m - len(times) + 1)])
+
+
+def _continued(times: np.ndarray, values: np.ndarray, longer: np.ndarray, kind: str) -> np.ndarray:
+    """Values continued to longer times: by the last one; of a spline along its last slope, so that it stays what it
+    is."""
+    if kind != "spline" or len(times) == len(longer):
+        return _padded(values, len(longer))
+    slope = CubicSpline(times, values, bc_type="natural")(times[-1], 1)
+    return np.concatenate([values, values[-1] + slope * (longer[len(times) :] - times[-1])])
 
 
 def _starts(data: Data, given: Mapping[str, Any]) -> dict[str, tuple[float | Unknown, ...]]:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .clock import Clock
 from .evaluation import Evaluation, Rows, Weights
 from .factors import Factors
 
@@ -54,6 +55,8 @@ class Minimum:
     noise: float  # relative error of the Jacobian: directions within it count as not determined
     left: float  # what is left to go, in radii of the confidence region
     tolerance: float  # of the integration, relative
+    # The integration's error in units of the noise, root of the sum of squares; NaN where it was not measured.
+    resolution: float = dataclasses.field(default=np.nan, kw_only=True)
 
 
 # Better weights, and by which part noise levels and precisions change. The last argument: whether the point is a
@@ -213,8 +216,9 @@ def descend(
     reweigh: Reweigh | None,
     steps: int,
     watch: Callable[[int, float, float, float], Any] | None = None,
+    clock: Clock | None = None,
 ) -> Minimum | None:
-    """Descends from a start.
+    """Descends from a start. Where the clock or an interrupt ends the search, the best point so far is its end.
 
     **Arguments:**
 
@@ -230,20 +234,55 @@ def descend(
     if found is None:
         return None
     here = _Here.of(merit, z, found, merit.weights(z, found), bounds, reweigh)
-    damping, history, count, idle, tightened = FIRST, [], 1, 0, np.inf
-    reason = f"stopped after {steps} steps, not yet converged; steps= allows more"
+    path = _Path(merit, here, [], 1, f"stopped after {steps} steps, not yet converged; steps= allows more")
+    try:
+        _descend(path, bounds, reweigh, steps, watch, clock or Clock())
+    except KeyboardInterrupt:
+        if clock is None:  # nobody who asked for this search would learn of it
+            raise
+        clock.interrupt()
+        path.reason = clock.after(max(len(path.history) - 1, 0))
+    here, merit = path.here, path.merit
+    return Minimum(
+        here.z, here.found, here.weights, here.cost, history=path.history, evaluations=path.count,
+        converged=path.reason.startswith("converged"), message=path.reason, noise=merit.noise, left=here.left,
+        tolerance=merit.noise,
+    )  # fmt: skip
+
+
+@dataclasses.dataclass
+class _Path:
+    """How far a search has come."""
+
+    merit: AbstractMerit
+    here: _Here
+    history: list[float]
+    count: int  # of evaluations
+    reason: str
+
+
+def _descend(
+    path: _Path, bounds: tuple[np.ndarray, np.ndarray], reweigh: Reweigh | None, steps: int,
+    watch: Callable[[int, float, float, float], Any] | None, clock: Clock,
+) -> None:  # fmt: skip
+    """Goes on until the search ends, and leaves its point in the path after each step."""
+    merit, here, history, damping, idle, tightened = path.merit, path.here, path.history, FIRST, 0, np.inf
     for k in range(steps + 1):
+        path.here, path.merit = here, merit
         history.append(here.cost)
         if watch is not None:
             misfit = float(np.sum(here.weights.bent(here.found.residual)[0] ** 2))
             watch(k, here.cost, misfit / max(here.weights.samples, 1.0), here.worst)
         if here.settled and here.left <= OFFSET:
-            reason = f"converged after {k} steps"
+            path.reason = f"converged after {k} steps"
             break
         if k == steps:
             break
+        if clock.is_over:
+            path.reason = clock.after(k)
+            break
         better, tried, damping = _better(merit, here, bounds, damping)
-        count += tried
+        path.count += tried
         least = merit.unnoticed(here.cost, here.heavy, len(here.z))
         gained = 0.0 if better is None else here.cost - better.cost
         idle = 0 if gained > least else idle + 1
@@ -253,36 +292,33 @@ def descend(
             continue
         stuck = better is None or damping > 1  # columns have norm one: beyond, damping alone keeps steps short
         along, tried = _along(merit, here, bounds, least) if stuck else (None, 0)
-        count += tried
+        path.count += tried
         if along is not None:
             here, damping, idle = _there(merit, along, bounds, reweigh), FIRST, 0
             continue
         finer, tried = _finer(merit, here, least)
         if finer is None and here.cost < tightened - least and max(here.open(merit)) > CLOSE:
             finer, tightened = merit.finer(0.1), here.cost  # noise that jumps between steps is not seen so close
-        count += tried
+        path.count += tried
         found = None if finer is None else finer.evaluate(here.z)
         if finer is not None and found is not None:
-            merit, damping, idle, count = finer, FIRST, 0, count + 1
+            merit, damping, idle = finer, FIRST, 0
+            path.count += 1
             here = _Here.of(merit, here.z, found, merit.at(here.z, found, here.weights), bounds, reweigh)
             continue
         # Weights that stay until the search has found its minimum are now free to change.
         here = _Here.of(merit, here.z, here.found, here.weights, bounds, reweigh, is_minimum=True)
         if here.settled or idle > PERSISTENCE + PATIENCE:
             closed = max(here.open(merit)) <= CLOSE
-            reason = f"{'converged' if closed else 'stopped'} after {k} steps: no step gains more"
+            path.reason = f"{'converged' if closed else 'stopped'} after {k} steps: no step gains more"
             break
         if better is None:
             weights = merit.next_weights(here.weights, here.following)
             here, damping = _Here.of(merit, here.z, here.found, weights, bounds, reweigh), FIRST
-    converged = reason.startswith("converged")
-    if converged:
-        here, polished = _polished(merit, here, bounds, reweigh, history)
-        count += polished
-    return Minimum(
-        here.z, here.found, here.weights, here.cost, history=history, evaluations=count, converged=converged,
-        message=reason, noise=merit.noise, left=here.left, tolerance=merit.noise,
-    )  # fmt: skip
+    path.here, path.merit = here, merit
+    if path.reason.startswith("converged"):
+        path.here, polished = _polished(merit, here, bounds, reweigh, history)
+        path.count += polished
 
 
 def _there(merit: AbstractMerit, to: Reached, bounds: tuple, reweigh: Reweigh | None) -> _Here:

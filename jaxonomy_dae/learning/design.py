@@ -10,9 +10,9 @@ choice (Atkinson & Donev 1992, Optimum Experimental Designs, §10). For some nam
 inverse takes the place of det H (Ds-optimality, ibid. §10.3), so that what is known of others counts only as far as it
 helps.
 
-What is not known at all is taken to be known to its natural scale: a positive parameter to a factor of e, another to
-its own size, an unknown start to its spread. So directions that nothing determines yet have a finite worth (Chaloner
-& Verdinelli 1995, Statistical Science 10:273).
+What is not known at all is taken to be known to its natural scale (`identifiability`): a positive parameter to a
+factor of e, another to its own size or what moves predictions as much as data vary, an unknown start to its spread. So
+directions that nothing determines yet have a finite worth (Chaloner & Verdinelli 1995, Statistical Science 10:273).
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ import scipy.linalg
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from ..base.errors import InitializationError, ModelError, SimulationError, nearest, whole_number
+from ..base.errors import InitializationError, ModelError, SimulationError, explained_keywords, nearest, whole_number
 from .coordinates import Coordinates
 from .data import Stacked
 from .estimate import Estimate
@@ -118,7 +118,7 @@ def known_of(source: Problem | Estimate, names: Sequence[str] | str | None, alon
     shared = free[: c.n_shared]
     if not shared.any():
         raise ModelError("only starts of single experiments are unknown: no other experiment can tell about these")
-    prior = np.where(weights.precision > 0, weights.precision, 1 / natural_scale(objective, z) ** 2)
+    prior = np.where(weights.precision > 0, weights.precision, 1 / natural_scale(objective, z, found) ** 2)
     count = int(shared.sum())
     information = np.diag(prior[:count])
     if not alone:
@@ -144,6 +144,7 @@ def _chosen(
     return chosen[: c.n_shared][shared]
 
 
+@explained_keywords()
 def next_experiment(
     source: Problem | Estimate,
     candidates: Sequence[Planned],

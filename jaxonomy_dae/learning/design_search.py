@@ -8,7 +8,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from ..base.errors import ModelError, SimulationError
+from ..base.errors import ModelError, SimulationError, explained_keywords
 from .design import informations, known_of
 from .estimate import Estimate
 from .experiment import Planned
@@ -35,6 +35,7 @@ class Design:
         return f"Design({values}: {self.gain:.4g} nat, {self.history[0]:.4g} at the start; {self.message})"
 
 
+@explained_keywords()
 def design_experiment(
     source: Problem | Estimate,
     make: Callable[[Float[np.ndarray, " p"]], Planned],

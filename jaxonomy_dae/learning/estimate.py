@@ -9,7 +9,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from ..base.errors import ModelError, nearest
+from ..base.errors import ModelError, explained_keywords, nearest
 from ..base.optional import Axes
 from ..run.system.system import AcausalSystem
 from .agreement import Whiteness, correlated, log_likelihood, rms_by_name, whiteness
@@ -20,7 +20,7 @@ from .discovery import Discovery, discover
 from .experiment import Experiment
 from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
-from .identifiability import Identifiability, identifiability, spreads
+from .identifiability import Identifiability, identifiability, natural_scale, spreads
 from .intervals import intervals, noise_intervals, profile
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
@@ -29,7 +29,7 @@ from .smoothing import followed
 from .table import Table
 from .training import Training
 from .unseen import Score, Unseen
-from .verdict import reasons
+from .verdict import asks_for_starts, reasons
 
 if TYPE_CHECKING:
     from .posterior import Posterior
@@ -45,6 +45,7 @@ class Estimate:
         weighted with `minimum.weights`.
     - `point`: the values of all coordinates at the estimate; `objective.coordinates` has their names.
     - `training`: the training before least squares, with `first=`.
+    - `tried`: the number of starting points of the search.
     """
 
     problem: "Problem"
@@ -54,6 +55,7 @@ class Estimate:
     system: AcausalSystem
     observers: dict[str, Any]
     training: Training | None = None
+    tried: int = 1
 
     @classmethod
     def of(
@@ -73,6 +75,12 @@ class Estimate:
     def reasons(self) -> tuple[str, ...]:
         """What is against this fit, each with what to try next; empty if it can be relied on."""
         return reasons(self)
+
+    @property
+    def asks_for_starts(self) -> bool:
+        """True if other starting points might lead to a better fit: the search did not end at a minimum that explains
+        the data."""
+        return asks_for_starts(self)
 
     @property
     def ok(self) -> bool:
@@ -107,6 +115,12 @@ class Estimate:
     def sigma(self) -> dict[str, float]:
         """Noise levels that were estimated, by name."""
         return self.objective.sigma(self.minimum.z, self.minimum.weights)
+
+    @property
+    def rho(self) -> dict[str, float]:
+        """Correlations of errors one sampling step apart that were estimated, by name."""
+        s = self.objective.stacked
+        return {name: float(self.objective.rho[j]) for j, name in enumerate(s.outputs) if np.isnan(s.rho[j])}
 
     # --- uncertainty -------------------------------------------------------------------------------------------
 
@@ -157,7 +171,8 @@ class Estimate:
     @property
     def residuals(self) -> dict[str, dict[str, np.ndarray]]:
         """Predictions less data of the experiments that were fitted, by experiment and name, in units of the noise: a
-        number for each row of the record, NaN where nothing was measured."""
+        number for each row of the record, NaN where nothing was measured. Where noise is correlated, `rho`, they are
+        what the sample before leaves open, so that they are independent."""
         return self._by_record(self.minimum.weights.scale * self.minimum.found.residual)
 
     def _by_record(self, values: Float[np.ndarray, " m"]) -> dict[str, dict[str, np.ndarray]]:
@@ -231,19 +246,30 @@ class Estimate:
             return float(scipy.stats.t.ppf(upper, max(self.freedom, 1.0)))
         return float(scipy.stats.norm.ppf(upper))
 
+    @explained_keywords()
     def table(self, level: float = 0.95, *, white: bool = True) -> Table:
         """Parameters and starts with linearized intervals on the coordinates' scale, so that intervals of positive
         parameters are positive. Notes mark values that reached a bound, are not determined, or were frozen. Estimated
         noise levels have χ² intervals. With `white=False` the intervals hold if residuals are correlated in time."""
         noise = noise_intervals(self.objective, self.minimum, self.root, level)
         spread = self.spread if white else self.correlated_spread
-        return intervals(self.objective, self.point, spread, self.quantile(level), level, noise)
+        return intervals(self.objective, self.point, spread, self._unknown, self.quantile(level), level, noise)
+
+    @functools.cached_property
+    def _unknown(self) -> Float[np.ndarray, " p"]:
+        """The spread at which each coordinate counts as not determined: a factor of e, or half of what a number without
+        a scale of its own would have to change by to matter, of which an interval then contains all."""
+        c, m, free = self.objective.coordinates, self.minimum, self.objective.free
+        out = np.full(len(c), np.inf)
+        out[free] = natural_scale(self.objective, m.z, m.found)
+        return np.where(c.log | np.isfinite(c.spread), out, out / 2)
 
     def identifiability(self) -> Identifiability:
         """The directions that the data determine, at the values found."""
         m = self.minimum
         return identifiability(self.objective, m.weights, m.found, m.z, self.minimum.noise)
 
+    @explained_keywords()
     def profile(self, names: Sequence[str] | str, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Intervals by profile likelihood: inside them the cost, with everything else refitted, exceeds the minimum by
         less than half a quantile of χ². They need no linearization. An infinite end is not determined.
@@ -270,6 +296,7 @@ class Estimate:
 
     # --- what follows ------------------------------------------------------------------------------------------
 
+    @explained_keywords()
     def band(
         self,
         name: str,
@@ -290,6 +317,7 @@ class Estimate:
         """
         return band(self, name, grid, law, along, self.quantile(level))
 
+    @explained_keywords()
     def predict(
         self, names: str | Sequence[str], ts: Any = None, experiment: int | str | Experiment = 0, level: float = 0.95,
         *, first: int | None = None,
@@ -306,9 +334,10 @@ class Estimate:
         objective, point, root, experiment = self._under(experiment, first)
         return prediction(objective, point, root, names, ts, experiment, self.quantile(level))
 
+    @explained_keywords()
     def score(self, experiment: Experiment, *, first: int | None = None) -> Score:
         """Scores the prediction of a new experiment. Its unknown starts are fitted to its `first` rows (default: all),
-        which count, too.
+        which count, too. Where it has no `sigma`, that of the fit counts.
 
         ```python
         print(fit.score(learning.Experiment(ts, {"pend.x": x}, initial={"pend.theta": 0.3})))
@@ -330,6 +359,7 @@ class Estimate:
         `along`."""
         return explored(self, name, along)
 
+    @explained_keywords()
     def sample(self, draws: int = 500, *, chains: int = 4, warmup: int = 150, seed: int = 0) -> "Posterior":
         """Samples of the posterior density, whose maximum is the fit, by the No-U-Turn sampler (Hoffman & Gelman 2014;
         extra `bayes`). Use it if intervals from a linearization are not good enough.
@@ -389,8 +419,9 @@ class Estimate:
     def log_likelihood(self) -> float:
         """ln L of the fitted samples, without priors. Prefer the model with the smallest 2p − 2 ln L (Akaike) or p ln n
         − 2 ln L (Schwarz), for p coordinates and n samples."""
-        return log_likelihood(self.minimum)
+        return log_likelihood(self.objective, self.minimum)
 
+    @explained_keywords()
     def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:
         """Replaces a network by closed forms: combinations of terms that are refitted to the data through the model,
         together with all other unknowns, and compared by BIC.

@@ -16,6 +16,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..host.threads import one_thread
 from .evaluation import Evaluation, Weights
 from .factors import Factors
 
@@ -113,7 +114,8 @@ class Evidence:
             data = np.sum((weights.row[:, None] * found.jacobian[:, group]) ** 2)
         # The prior's own covariance, from the singular values of the derivatives' rows relative to those of weights.
         scaled = np.sqrt(stiffness[of_row] / old)[:, None] * slopes if len(slopes) else slopes
-        left, s, _ = np.linalg.svd(scaled, full_matrices=False)
+        with one_thread(len(scaled) * size**2):
+            left, s, _ = np.linalg.svd(scaled, full_matrices=False)
         shares = s**2 / (1 + s**2)
         determined = size - float(np.sum(shares)) - old * float(np.sum(root[group] ** 2))
         square = float(np.sum((z - weights.mean)[group] ** 2))
@@ -143,7 +145,8 @@ def log_evidence(z: Float[np.ndarray, " p"], found: Evaluation, weights: Weights
     whole = weights.applied(z, found).jacobian
     size = np.linalg.norm(whole, axis=0)
     size[size == 0] = 1.0
-    logs = [np.log(np.linalg.svd(rows, compute_uv=False)) for rows in (prior / size[has_prior], whole / size)]
+    with one_thread(len(whole) * len(size) ** 2):
+        logs = [np.log(np.linalg.svd(rows, compute_uv=False)) for rows in (prior / size[has_prior], whole / size)]
     # Sizes of coordinates without a prior stand for units, which are the same for all that is compared.
     return (
         weights.log_rows

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jax.typing import ArrayLike
 
-from ..base.errors import ModelError, nearest, whole_number
+from ..base.errors import ModelError, explained, nearest, whole_number
 from ..compile.lowering.plan import SystemPlan
 from .noise import ESTIMATE, Noise
 from .priors import is_finite
@@ -23,6 +23,7 @@ Samples: TypeAlias = float | tuple[Numbers, Numbers] | tuple[Numbers, Numbers, s
 UNEVEN = 1e-3  # of a time step, by which steps may differ and still count as even
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class Unknown:
     """A start that is estimated.
@@ -43,6 +44,7 @@ class Unknown:
             raise ModelError(f"Unknown: spread is a standard deviation > 0, or None; got {self.spread!r}")
 
 
+@explained
 @dataclasses.dataclass(frozen=True, eq=False)
 class Experiment:
     """One record.
@@ -54,7 +56,7 @@ class Experiment:
         arrays with one value for each sample, such as `0.01 + 0.02 * abs(y)` for partly relative errors; or
         `"estimate"`: estimated from the residuals, one for each name, the same in all experiments; or `Noise(...)`, for
         levels that are shared by sensors or proportional to a scale, and for outliers.
-    - `inputs`: by name, `(times, values)`, or with `"held"` or `"cubic"` as a third entry, or a constant.
+    - `inputs`: by name, `(times, values)`, or with `"held"`, `"spline"` or `"cubic"` as a third entry, or a constant.
     - `initial`: values at `t0` by variables' names, known (numbers) or `Unknown`. The name of a parameter gives this
         experiment a value of its own.
     - `weight`: the weight of the record.
@@ -382,6 +384,7 @@ def _cells(texts: list[str]) -> np.ndarray | list[str]:
         return texts
 
 
+@explained
 @dataclasses.dataclass(frozen=True, eq=False)
 class Planned:
     """An experiment that could be made, for `learning.next_experiment`.

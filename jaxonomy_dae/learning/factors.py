@@ -45,7 +45,8 @@ class Factors:
             return self
         scale = np.where(columns, self.scale[columns].max(), self.scale)
         rows = self.singular[:, None] * self.right.T * (self.scale / scale)
-        left, singular, right = scipy.linalg.svd(rows, full_matrices=False, check_finite=False)
+        with one_thread(rows.shape[0] * rows.shape[1] ** 2):
+            left, singular, right = scipy.linalg.svd(rows, full_matrices=False, check_finite=False)
         return Factors(singular, right.T, scale, left.T @ self.projected)
 
     def rank(self, noise: float) -> int:

@@ -6,6 +6,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
+from ..run.system.inputs import CURVED
 from ..run.system.system import AcausalSystem
 from .data import Stacked
 from .experiment import Unknown
@@ -79,7 +80,7 @@ def _windows(
     kinds = dict(s.kinds)
     found = {}
     for name, (times, values) in s.inputs.items():
-        if kinds[name] == "cubic":  # whose slopes follow from all samples
+        if kinds[name] in CURVED:  # whose slopes follow from all samples
             first, width = np.zeros(before.shape, int), times.shape[1]
         else:
             first = np.stack([np.searchsorted(*a, side="right") - 1 for a in zip(times, before, strict=True)])

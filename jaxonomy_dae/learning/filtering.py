@@ -11,7 +11,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..base.errors import ModelError, nearest, whole_number
+from ..base.errors import ModelError, explained, nearest, whole_number
+from ..run.system.inputs import CURVED
 from ..run.system.system import AcausalSystem
 from .coordinates import Coordinate
 from .data import Stacked
@@ -25,6 +26,7 @@ FAR = 1e6  # how far, as a factor, a level may move from its guess: beyond, it c
 HIDDEN = 0.1  # guessed noise of a state that was not measured, relative to measured ones, each in units of its size
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class Filter:
     """Process noise, for `Problem(method=...)`: the equations hold up to white noise,
@@ -59,6 +61,7 @@ class Filter:
         whole_number(self.substeps, "Filter: substeps")
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class Innovations:
     """Predictions one step ahead, for `Problem(method=...)`: each sample moves the states by a constant gain K times
@@ -136,7 +139,7 @@ def structure_and_extras(
 
     - `ModelError` for names that are not those of differential states or outputs.
     """
-    linear = is_linear(system) and "cubic" not in dict(stacked.kinds).values()
+    linear = is_linear(system) and not {*dict(stacked.kinds).values()} & {*CURVED}
     units = dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))
     if isinstance(method, Innovations):
         gains = _gains(method, system, stacked)

@@ -1,8 +1,10 @@
 """What data can tell: the Fisher information, scaled, and what is not determined, in words.
 
 Each coordinate is measured by what it would be natural to be unsure of: a parameter on a logarithmic scale by a factor
-of e, another by its own size, a start by its spread. A direction is not determined if the data leave it as unsure as
-that, or more.
+of e, one with a normal prior by its spread, and any other by its own size or by the change that moves predictions as
+much as the data vary, whichever is more. An offset near zero is thus known, if it is small beside what is measured. A
+direction is not determined if the data leave it as unsure as that, or more. Nothing of this depends on units, or on
+where a search began.
 """
 
 import dataclasses
@@ -77,10 +79,25 @@ class Identifiability:
         return ax
 
 
-def natural_scale(objective: Objective, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
-    """The uncertainty of each free coordinate that counts as complete, shape (f,): one, and a weight's own size."""
+def natural_scale(objective: Objective, z: Float[np.ndarray, " f"], found: Evaluation) -> Float[np.ndarray, " f"]:
+    """The uncertainty of each free coordinate that counts as complete, on the coordinates' scale, shape (f,)."""
     c, free = objective.coordinates, objective.free
-    return np.where(c.is_weight[free] & (z != 0), np.abs(z), 1.0)
+    size, plain = np.abs(z), ~(c.log | c.is_weight | np.isfinite(c.spread))[free]
+    # Where shifts measure biases of networks, columns of weights say nothing about a number by itself.
+    by_signal = np.abs(found.jacobian[:, plain]) / signals(objective)[:, None]
+    reach = np.sum(by_signal**2, axis=0) / np.maximum(np.sum(by_signal > 0, axis=0), 1)
+    size[plain] = np.maximum(size[plain], 1 / np.sqrt(np.where(reach > 0, reach, np.inf)))
+    return np.where((c.log | np.isfinite(c.spread))[free] | (size == 0), 1.0, size)
+
+
+def signals(objective: Objective) -> Float[np.ndarray, " m"]:
+    """By how much the output that each sample is of varies in the data; the size of one that does not."""
+    s, rows = objective.stacked, objective.rows
+    values, out = s.values[rows], np.ones(len(rows[0]))
+    for j in np.unique(rows[2]):
+        own = values[rows[2] == j]
+        out[rows[2] == j] = np.std(own) or np.max(np.abs(own)) or 1.0
+    return out
 
 
 def identifiability(
@@ -91,7 +108,7 @@ def identifiability(
     names = np.array(c.names)[free]
     groups = np.array(c.group)[free]
     weight = c.is_weight[free]
-    scale = natural_scale(objective, z)
+    scale = natural_scale(objective, z, found)
     r, jacobian = weights.applied(z, found)
     scaled = jacobian * scale
     singular, right = np.linalg.svd(scaled, full_matrices=False)[1:]

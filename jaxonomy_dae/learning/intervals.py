@@ -9,9 +9,10 @@ import scipy.optimize
 import scipy.stats
 from jaxtyping import Float
 
+from .coordinates import end_text
 from .descent import Minimum
 from .evaluation import Weights
-from .objective import Objective
+from .objective import AWAY, Objective
 from .table import Row, Table
 
 FURTHEST = 10  # doublings of the linear interval before an end counts as infinite
@@ -78,10 +79,11 @@ def profile(
 
 
 def intervals(
-    objective: Objective, point: Float[np.ndarray, " p"], spreads: Float[np.ndarray, " p"], factor: float, level: float,
-    noise: list[Row],
+    objective: Objective, point: Float[np.ndarray, " p"], spreads: Float[np.ndarray, " p"],
+    scale: Float[np.ndarray, " p"], factor: float, level: float, noise: list[Row],
 ) -> Table:  # fmt: skip
-    """As `Estimate.table`: parameters and starts, with what is to be said of each, and noise levels."""
+    """As `Estimate.table`: parameters and starts, with what is to be said of each, and noise levels. `scale`: the
+    spread at which a coordinate counts as not determined."""
     c = objective.coordinates
     low, high = c.z_bounds
     natural = c.natural(point)
@@ -93,17 +95,20 @@ def intervals(
         ends = z - factor * spread, z + factor * spread
         if k not in moved:
             note = "frozen" if c.fixed[k] else "held out: fitted to this experiment alone"
+            if not c.fixed[k] and objective.has_no_weight[k]:
+                note = "no weight: kept at its guess"
         elif z <= low[k] or z >= high[k]:
-            note = f"bound reached: {natural[k]:g}"
+            note = f"bound reached: {end_text(natural[k])}"
         elif away[k]:
             note = "ran away"
             spread = np.inf
         elif np.isfinite(c.spread[k]) and spread > SILENT * c.spread[k]:
             note = "by its prior"
-        elif spread >= 1:
+        elif spread >= scale[k]:
             note = "not determined"
         inside = (-np.inf, np.inf)
-        if np.isfinite(spread):
+        # A factor beyond which no search goes says nothing, however many digits its ends have.
+        if np.isfinite(spread) and not (c.log[k] and factor * spread > np.log(AWAY)):
             inside = np.clip([c.natural_at(k, e) for e in ends], c.low[k], c.high[k])
         rows.append(Row(c.names[k], float(natural[k]), float(inside[0]), float(inside[1]), c.units[k], note))
     return Table((*rows, *noise), level)
@@ -120,7 +125,17 @@ def noise_intervals(objective: Objective, minimum: Minimum, root: Float[np.ndarr
     for k, name in enumerate(evidence.labels):
         own = evidence.noise == k
         freedom = max(float(np.sum(weights.share[own] ** 2) - np.sum(taken[own])), 1.0)
+        # ln σ² of errors of first order has a variance (1 + ρ²)/(1 − ρ²) times that of independent ones.
+        squares = np.mean(objective.rho[objective.rows[2][own]] ** 2)
+        freedom = max(freedom * (1 - squares) / (1 + squares), 1.0)
         value = float(1 / (weights.scale * evidence.unit)[own][0])
         low, high = (value * np.sqrt(freedom / scipy.stats.chi2.ppf(0.5 + s * level / 2, freedom)) for s in (1, -1))
         rows.append(Row(f"sigma of {name}", value, float(low), float(high), units.get(name, ""), ""))
+    for j in np.flatnonzero(np.isnan(objective.stacked.rho)):
+        own, rho = objective.rows[2] == j, float(objective.rho[j])
+        # The variance of ρ is (1 − ρ²)/n, and that of artanh ρ, which is more nearly normal, 1/(n (1 − ρ²)).
+        freedom = max(float(np.sum(weights.share[own] ** 2) - np.sum(taken[own])), 1.0)
+        wide = scipy.stats.norm.ppf(0.5 + level / 2) / np.sqrt(freedom * (1 - rho**2))
+        low, high = np.tanh(np.arctanh(rho) - wide), np.tanh(np.arctanh(rho) + wide)
+        rows.append(Row(f"rho of {objective.stacked.outputs[j]}", rho, float(low), float(high), "", ""))
     return rows

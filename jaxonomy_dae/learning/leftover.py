@@ -1,6 +1,8 @@
 """Whether what a fit leaves over is noise: one test of one level, made of several that each look for another error.
 
-- χ² of the samples whose noise level is known: a model that misses more than the noise.
+- χ² of the samples whose noise level is known: a model that misses more than the noise; of an output, that it misses
+  less.
+- The greatest residual, and the kurtosis (`outliers`): samples that are wrong.
 - Correlations of neighbours, by the statistic of Ljung and Box (1978): noise that is correlated.
 - The highest peak of the periodogram (Fisher 1929), of one output and of all: a mode that the model lacks.
 - Power at the lowest 1, 2, 4, … frequencies (a smooth test; Neyman 1937): errors as slow as what the model describes.
@@ -19,8 +21,11 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.special import chdtrc
+from jaxtyping import Bool, Float, Int
+from scipy.special import chdtr, chdtrc
+
+from ..host.threads import one_thread
+from .outliers import heavy_tails, outliers
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -32,6 +37,7 @@ DRAWS = 1999
 SURE = 499  # draws after which a third of the level counts as below it: the level itself looks so once in 300 times
 BATCH = 50  # draws at once: most right models are known by the first
 ROOM = 2e7  # numbers at once: 160 MB
+BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
 FEWEST = 4  # samples of a series, below which there is nothing to correlate
 SHORTEST = 8  # frequencies of a record below which its lowest ones are those that a fit takes away
 FINE = 2  # frequencies for each that is independent: a peak between two of these loses up to three fifths of its power
@@ -47,8 +53,9 @@ class Series(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """What residuals of one output may correlate with, over all experiments: `each` by name, of length one; the `basis`
-    of all; and how many of them a fit does not take up."""
+    """What residuals of one output may correlate with, over all experiments: `each` by name, of length one, and with
+    them some by which residuals are only described; the `basis` of what is tested; and how many of these a fit does not
+    take up."""
 
     at: Int[np.ndarray, " n"]
     basis: Float[np.ndarray, "n k"]
@@ -64,6 +71,7 @@ class Leftover:
     - `share`: the root of each residual's weight.
     - `leverage`: L, of which L Lᵀ is what the fit takes from the noise, weights included.
     - `known`: True for samples whose noise level is known; `freedom`: of their χ².
+    - `loose`: of each output whose residuals may be too small, samples whose level is known, and degrees of freedom.
     """
 
     scores: Float[np.ndarray, " m"]
@@ -73,6 +81,7 @@ class Leftover:
     signals: tuple[Signals, ...]
     known: np.ndarray
     freedom: float
+    loose: tuple[tuple[Int[np.ndarray, " _"], float], ...] = ()
 
     @classmethod
     def of(cls, fit: "Estimate", counts: Iterable[tuple[int, int]]) -> "Leftover":
@@ -89,9 +98,14 @@ class Leftover:
         for j in dict.fromkeys(one.output for one in series):
             own = [one for one in series if one.output == j]
             at = np.concatenate([one.at for one in own])
-            found.append(signals(at, _parts(fit, own), leverage / share[:, None]))
+            found.append(signals(at, _parts(fit, own), leverage / share[:, None], o.has_variances))
+        scores, loose = m.weights.scores(m.found.residual), []
+        for j in np.unique(o.rows[2][known]):
+            at = np.flatnonzero(known & (o.rows[2] == j))
+            if np.mean(scores[at] ** 2) > BELOW**2:
+                loose.append((at, max(float(np.sum(share[at] ** 2) - np.sum(leverage[at] ** 2)), 1.0)))
         return cls(
-            m.weights.scores(m.found.residual), share, leverage, series, tuple(found), known,
+            scores, share, leverage, series, tuple(found), known, loose=tuple(loose),
             freedom=max(count * fit.freedom / m.weights.samples, 1.0),
         )  # fmt: skip
 
@@ -104,7 +118,8 @@ class Leftover:
 
     @functools.cached_property
     def _factors(self) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, " k"]]:
-        left, sizes, _ = np.linalg.svd(self.leverage, full_matrices=False)
+        with one_thread(len(self.leverage) * self.leverage.shape[1] ** 2):
+            left, sizes, _ = np.linalg.svd(self.leverage, full_matrices=False)
         return left, np.minimum(sizes, 1.0)
 
     @functools.cached_property
@@ -133,6 +148,9 @@ class Leftover:
         if self.known.any():
             chi2 = np.sum((self.share * residuals)[:, self.known] ** 2, axis=1)
             found["χ²"] = chdtrc(self.freedom, chi2)
+        if self.loose:
+            sums = [np.sum((self.share * residuals)[:, at] ** 2, axis=1) for at, _ in self.loose]
+            found["small χ²"] = _any([chdtr(free, chi2) for (_, free), chi2 in zip(self.loose, sums, strict=True)])
         if not self.series:
             return found
         scaled, spectra, neighbours = np.array(residuals), [], []
@@ -142,6 +160,7 @@ class Leftover:
             own = scaled[:, one.at] = own / np.where(size > 0, size, 1.0)
             spectra.append(periodogram(own))
             neighbours.append(_neighbours(own))
+        found["outliers"] = _any([heavy_tails(scaled[:, at]) for at in self.by_output.values()])
         found["neighbours"] = _any([chdtrc(lags, statistic) for statistic, lags in neighbours])
         if len(neighbours) > 1:
             statistics, lags = zip(*neighbours, strict=True)
@@ -156,6 +175,25 @@ class Leftover:
         return found
 
     @functools.cached_property
+    def by_output(self) -> dict[int, Int[np.ndarray, " _"]]:
+        """The samples of each output whose form is judged."""
+        outputs = dict.fromkeys(one.output for one in self.series)
+        return {j: np.concatenate([one.at for one in self.series if one.output == j]) for j in outputs}
+
+    @functools.cached_property
+    def outliers(self) -> Bool[np.ndarray, " m"]:
+        """True for single samples that lie far out, of the series whose form is judged."""
+        found = np.zeros(len(self.scores), bool)
+        for one in self.series:
+            found[one.at] = outliers(self.scores[one.at])
+        return found
+
+    @functools.cached_property
+    def without_outliers(self) -> dict[str, float]:
+        """The probability of each test if single samples that lie far out were as predicted."""
+        return {name: float(p[0]) for name, p in self.tested(np.where(self.outliers, 0.0, self.scores)[None]).items()}
+
+    @functools.cached_property
     def _left(self) -> list[Float[np.ndarray, " _"]]:
         """Of the power of noise at each frequency, the part that a fit leaves."""
         own = self.leverage / self.share[:, None]
@@ -166,22 +204,6 @@ class Leftover:
         """The series that have their frequencies in common: of as many samples. A mode shows in all of them."""
         sizes = [len(one.at) for one in self.series]
         return [[k for k, n in enumerate(sizes) if n == size] for size in dict.fromkeys(sizes)]
-
-    # --- what stands out -----------------------------------------------------------------------------------------
-
-    def strongest_signal(self) -> tuple[int, str]:
-        """(the output, the name of the signal that its residuals correlate with most)."""
-        found = [(np.abs(self.scores[one.at] @ one.each), one) for one in self.signals]
-        values, one = max(found, key=lambda pair: pair[0].max())
-        output = next(s.output for s in self.series if s.at[0] in one.at)
-        return output, one.names[int(np.argmax(values))]
-
-    def slowest(self) -> int:
-        """The output with the most power at low frequencies."""
-        power = {one.output: 0.0 for one in self.series}
-        for one in self.series:
-            power[one.output] += float(np.sum(periodogram(self.scores[None, one.at])[0, : 4 * FINE]))
-        return max(power, key=lambda output: power[output])
 
 
 def periodogram(values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "s f"]:
@@ -227,16 +249,20 @@ def signals(
     at: Int[np.ndarray, " n"],
     parts: list[tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]],
     leverage: Float[np.ndarray, "m r"],
+    is_filter: bool = False,
 ) -> Signals:
     """The signals of one output: constants and drifts; its predictions, their rates, squares and cubes, and what these
     become if they drift; and inputs. A gain that is wrong shows as the prediction, a delay as its rate.
 
     - `parts`: (predictions, times, inputs by name) of each experiment.
+    - `is_filter`: whether each prediction is made from the samples before it. The next one then contains the present
+        error, so rates are those of the past.
     """
     rows = []
     for y, t, inputs in parts:
         tau = 2 * (t - t.mean()) / (np.ptp(t) or 1.0)
-        rows.append(np.stack([y, np.gradient(y, t), tau, *inputs.values()]))
+        rate = np.diff(y, prepend=y[:1]) / np.diff(t, prepend=2 * t[0] - t[1]) if is_filter else np.gradient(y, t)
+        rows.append(np.stack([y, rate, tau, *inputs.values()]))
     (y, rate, tau, *others) = (row - row.mean() for row in np.concatenate(rows, axis=1))
     found = {
         "a constant": np.ones_like(y), "the prediction": y, "the rate of change of the prediction": rate,
@@ -246,9 +272,14 @@ def signals(
         "the square of its rate": rate * rate, "the prediction times its rate": y * rate,
         "the square of time": tau * tau,
     }  # fmt: skip
+    tested = len(found)
+    found |= {
+        "the direction of its rate": np.sign(rate), "the sign of the prediction": np.sign(y),
+        "the rate times its size": rate * np.abs(rate),
+    }  # fmt: skip
     columns = np.stack(list(found.values()), axis=1)
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
-    basis, values, _ = np.linalg.svd(columns, full_matrices=False)
+    basis, values, _ = np.linalg.svd(columns[:, :tested], full_matrices=False)
     basis = basis[:, values > ALIKE * values[0]]
     count = max(basis.shape[1] - float(np.sum((leverage[at].T @ basis) ** 2)), 1.0)
     return Signals(at, basis, count, tuple(found), columns)
@@ -257,9 +288,10 @@ def signals(
 def _parts(fit: "Estimate", series: list[Series]) -> list[tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]]:
     """(predictions, times, inputs) of some series."""
     s, rows, parts = fit.objective.stacked, fit.objective.rows[1], []
+    errors = fit.objective.colour.coloured(fit.minimum.found.residual)
     for one in series:
         k, i = one.experiment, rows[one.at]
         t = s.times[k, i]
         inputs = {name: np.interp(t, times[k], values[k]) for name, (times, values) in s.inputs.items()}
-        parts.append((fit.minimum.found.residual[one.at] + s.values[k, i, one.output], t, inputs))
+        parts.append((errors[one.at] + s.values[k, i, one.output], t, inputs))
     return parts

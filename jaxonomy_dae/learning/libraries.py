@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import sympy
 from jax.typing import ArrayLike
 
-from ..base.errors import ModelError, nearest
+from ..base.errors import ModelError, explained_keywords, nearest
 from ..graph.expressions.from_sympy import UnsupportedExpression, read, symbols_of
 from ..write.networks import count_outputs, of_scalars
 from .term import AbstractTerm, Inner, OfFunction, Power, Written, inner_of, local_name
@@ -45,6 +45,7 @@ class Library:
         return found
 
 
+@explained_keywords()
 def powers(highest: int) -> Library:
     """The terms v, v|v|, v|v|², …, v|v|^(highest−1): the usual terms of friction and drag.
 

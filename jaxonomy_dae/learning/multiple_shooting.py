@@ -15,8 +15,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, explained
 from .block_elimination import Blocks, eliminate, linear
+from .clock import Clock
 from .descent import FIRST, OFFSET, PATIENCE, SETTLED, TRIALS, Minimum, can_move, damping_after, offset
 from .evaluation import Weights
 from .evidence import Evidence
@@ -35,6 +36,7 @@ CLOSED = 0.1  # gaps that count as none, in units of the integration's relative 
 ROUNDED = 1e-12  # relative rounding errors of a segment's Jacobian, of some thousand operations
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class Shooting:
     """Multiple shooting (Bock 1981), for `Problem(method=...)`.
@@ -209,10 +211,20 @@ def shoot(
         merit, _, _ = _reweighed(merit, point, evidence, tolerance, ended=False)
     converged, message = False, f"stopped after {steps} steps, not yet converged; steps= allows more"
     remaining, idle, before = np.inf, 0, np.inf
+    clock = objective.clock or Clock()
     for k in range(steps + 1):
+        if clock.is_over:
+            message = clock.after(len(history))
+            break
         history.append(merit.cost(point))
         gain = 0.0
-        found = descent.step(merit, point) if k < steps else None
+        try:
+            found = descent.step(merit, point) if k < steps else None
+        except KeyboardInterrupt:
+            if objective.clock is None:
+                raise
+            clock.interrupt()
+            continue
         if found is not None:
             point, gain = found
         left = 0.5 * merit.continuity**2 * float(np.sum(point.blocks.gap**2))

@@ -14,12 +14,13 @@ import scipy.special
 import scipy.stats
 from jaxtyping import Bool, Float
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, explained
 from .priors import is_finite
 
 ESTIMATE = "estimate"
 
 
+@explained
 @dataclasses.dataclass(frozen=True, eq=False)
 class Noise:
     """The noise of one signal, for `Experiment(sigma={"tank.h": Noise(...)})`.
@@ -31,6 +32,9 @@ class Noise:
     - `student`: degrees of freedom ν > 1 of Student's distribution, whose heavy tails take outliers lightly; 4 is
         common. The level is its scale, less than its standard deviation.
     - `huber`: from how many levels on residuals count linearly, not squared (Huber 1964); 1.5 is common.
+    - `rho`: the correlation of errors one sampling step apart, between −1 and 1, of noise of first order; or
+        `"estimate"`. Errors that are g steps apart correlate by ρᵍ. The level stays the standard deviation of one
+        sample. For fits of runs.
     """
 
     level: float | str = ESTIMATE
@@ -38,8 +42,13 @@ class Noise:
     shared: str = ""
     student: float | None = None
     huber: float | None = None
+    rho: float | str | None = None
 
     def __post_init__(self):
+        if self.rho is not None and self.rho != ESTIMATE and not (is_finite(self.rho) and abs(float(self.rho)) < 1):
+            raise ModelError(f"Noise: rho is a correlation between −1 and 1, or 'estimate'; got {self.rho!r}")
+        if self.rho is not None and (self.student is not None or self.huber is not None):
+            raise ModelError("Noise: errors that are correlated, rho, are normal: leave student and huber out")
         if self.level != ESTIMATE and not (is_finite(self.level) and float(self.level) > 0):
             raise ModelError(f"Noise: level is a standard deviation > 0, or 'estimate'; got {self.level!r}")
         if self.shared and self.level != ESTIMATE:
@@ -64,9 +73,14 @@ class Noise:
         return self.student or math.inf, self.huber or math.inf
 
     @property
+    def correlation(self) -> float:
+        """The correlation of neighbours: zero for white noise, NaN if it is to be estimated."""
+        return math.nan if isinstance(self.rho, str) else float(self.rho or 0.0)
+
+    @property
     def is_plain(self) -> bool:
-        """True for normal noise with a level of its own, which is the same for all samples."""
-        return self.scale is None and not self.shared and self.tails == (math.inf, math.inf)
+        """True for white normal noise with a level of its own, which is the same for all samples."""
+        return self.scale is None and not self.shared and self.tails == (math.inf, math.inf) and self.rho is None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

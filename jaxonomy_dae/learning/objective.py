@@ -20,6 +20,8 @@ from scipy.special import chdtrc
 from ..base.aliases import PyTree
 from ..run.system.system import AcausalSystem
 from .blocks import Block, block_of
+from .clock import Clock
+from .colour import Colour
 from .coordinates import Coordinates
 from .data import Stacked
 from .descent import AbstractMerit, Minimum, descend
@@ -65,9 +67,10 @@ class Predicted:
 
 
 FINEST = 1e3  # roundings, to which an integration of some hundred steps can be told to keep
-# Factor, or change in its own size, by which a number without bounds may leave the start of its search: a guess in
-# another unit (nano) is still within reach, and what runs further is not held by the data.
+# Factor by which a positive number without bounds may leave the start of its search: a guess in another unit (nano) is
+# still within reach, and what runs further is not held by the data.
 AWAY = 1e9
+FAR = AWAY**2  # the same of other numbers in units of their start, which may itself be next to nothing
 FEW = 8  # columns up to which residuals alone cost almost as much as with their Jacobian, and a program of their own
 MANY = 40  # numbers of one experiment beyond which a gradient backwards costs less: of 97, 6 ms where forwards it is 14
 
@@ -95,9 +98,31 @@ class Objective:
     near: Float[np.ndarray, " f"] | None = dataclasses.field(default=None, kw_only=True)
     # What is told of each step: its number, the cost, χ² for each sample, and what remains.
     watch: Callable[[int, float, float, float], None] | None = dataclasses.field(default=None, kw_only=True)
+    clock: Clock | None = dataclasses.field(default=None, kw_only=True)  # what ends searches early
     # Networks with a prior of smoothness, and where they have it.
     laws: tuple[Law, ...] = dataclasses.field(default=(), kw_only=True)
     predictor: AbstractPredictor = dataclasses.field(default=Runs(), kw_only=True)
+    # The correlation of neighbouring errors of each output; None: as the data say, and where it is unknown, zero.
+    correlations: Float[np.ndarray, " k"] | None = dataclasses.field(default=None, kw_only=True)
+
+    @property
+    def rho(self) -> Float[np.ndarray, " k"]:
+        """The correlation of neighbouring errors of each output."""
+        return np.nan_to_num(self.stacked.rho) if self.correlations is None else self.correlations
+
+    def with_rho(self: Same, rho: Float[np.ndarray, " k"]) -> Same:
+        """A copy with these correlations of neighbouring errors."""
+        return dataclasses.replace(self, correlations=rho)
+
+    @property
+    def white(self: Same) -> Same:
+        """A copy whose errors are independent."""
+        return self.with_rho(np.zeros(len(self.rho)))
+
+    @functools.cached_property
+    def colour(self) -> Colour:
+        """The filter that makes errors of the samples that count independent."""
+        return Colour.of(self.stacked, self.rows, self.rho)
 
     @property
     def has_variances(self) -> bool:
@@ -125,11 +150,20 @@ class Objective:
 
     @functools.cached_property
     def free(self) -> Bool[np.ndarray, " p"]:
-        """The coordinates that are searched: not frozen, and not of an experiment that does not count."""
+        """The coordinates that are searched: not frozen, and not of experiments without weight or that do not count."""
         c = self.coordinates
-        owner = np.repeat(np.arange(len(self.counted)), c.n_own)
-        counts = np.concatenate([np.ones(c.n_shared, bool), self.counted[owner]])
-        return ~c.fixed & counts
+        return ~c.fixed & self.owned(self.counted, shared=True) & ~self.has_no_weight
+
+    @property
+    def has_no_weight(self) -> Bool[np.ndarray, " p"]:
+        """True for the own coordinates of experiments of weight zero, of which nothing is asked."""
+        return self.owned(self.stacked.weight == 0)
+
+    def owned(self, each: Bool[np.ndarray, " e"], shared: bool = False) -> Bool[np.ndarray, " p"]:
+        """For each coordinate, what holds of the experiment that owns it, or of those that experiments share."""
+        c = self.coordinates
+        owner = np.repeat(np.arange(len(each)), c.n_own)
+        return np.concatenate([np.full(c.n_shared, shared), each[owner]])
 
     @functools.cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +176,7 @@ class Objective:
         """(lower, upper) ends of a search for the free coordinates, shape (f,) each: bounds, and where there is none,
         so far from the start that the data do not hold the coordinate."""
         c, (low, high) = self.coordinates, self.bounds
-        reach = np.where(c.is_weight, np.inf, np.where(c.log, np.log(AWAY), AWAY))[self.free]
+        reach = np.where(c.is_weight, np.inf, np.where(c.log, np.log(AWAY), FAR))[self.free]
         start = c.z_start[self.free]
         return np.where(np.isfinite(low), low, start - reach), np.where(np.isfinite(high), high, start + reach)
 
@@ -247,7 +281,7 @@ class Objective:
 
     def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
         """Residuals and Jacobian of the free coordinates, with their variances if the predictor says them; None where a
-        run that counts fails."""
+        run that counts fails. Where errors are correlated, residuals are their innovations."""
         full = self.full(z)
         found, variance = self._differentiated(full, self.counted)
         c = self.coordinates
@@ -260,11 +294,15 @@ class Objective:
                 s = variance.outputs[self.rows]
                 slope = c.pulled(full, variance.jacobian(self.rows) / s[:, None])
                 parts += [np.where(s > 0, s, np.nan), slope[:, self.free]]
+            elif self.rho.any():
+                parts = [self.colour.whitened(part) for part in parts]
         return Evaluation(*parts) if all(np.isfinite(a).all() for a in parts) else None
 
     def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
         """Residuals alone; None where a run that counts fails."""
         found = self.outputs(self.full(z))[self.rows] - self.stacked.values[self.rows]
+        if self.rho.any():
+            found = self.colour.whitened(found)
         return found if np.isfinite(found).all() else None
 
     def _runs(self, full: Float[np.ndarray, " p"]) -> Float[np.ndarray, "e n _"]:
@@ -329,7 +367,7 @@ class Objective:
             return here if priors is None else here.with_priors_of(priors)
 
         reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
-        return descend(self._merit(weigh), start, self.limits, reweigh, steps, self.watch)
+        return descend(self._merit(weigh), start, self.limits, reweigh, steps, self.watch, self.clock)
 
     def _merit(self, weigh: Weigh) -> AbstractMerit:
         def finer(factor: float) -> AbstractMerit | None:
@@ -384,12 +422,12 @@ class Objective:
         for group in self.evidence.groups:
             given[group] = 0.0
         weights = dataclasses.replace(found.weights, precision=given, bends=None)
-        return weights.cost(found.z, found.found.residual) - weights.log_rows
+        return weights.cost(found.z, found.found.residual) - weights.log_rows + self.colour.log_scale(weights.share)
 
     def standardized(
         self, full: Float[np.ndarray, " p"], sigma: dict[str, float], rows: tuple[np.ndarray, ...]
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """(residuals of chosen samples in units of the noise, these units)."""
+        """(residuals of chosen samples in units of the noise, or of correlated noise, their innovations; the units)."""
         s, variance = self.with_noise(sigma).stacked, None
         if self.has_variances:
             found, variance = self._differentiated(full, np.ones(len(self.counted), bool))
@@ -398,7 +436,10 @@ class Objective:
             outputs = self.outputs(full)
         with np.errstate(invalid="ignore"):
             level = np.where(np.isnan(s.sigma), s.unit, s.sigma) if variance is None else np.sqrt(variance.outputs)
-        return (outputs[rows] - s.values[rows]) / level[rows], level[rows]
+            errors = outputs[rows] - s.values[rows]
+            if self.rho.any():
+                errors = Colour.of(s, rows, self.rho).whitened(errors)
+        return errors / level[rows], level[rows]
 
     # --- experiments that are held out ---------------------------------------------------------------------------
 
@@ -411,9 +452,8 @@ class Objective:
         fixed = np.array(c.fixed)
         fixed[: c.n_shared] = True
         c = dataclasses.replace(c, start=c.natural(full), fixed=fixed)
-        alone = dataclasses.replace(
-            self.with_noise(self.sigma(z, weights)), coordinates=c, counted=held, penalties={}, laws=(), watch=None
-        )
+        known = self.with_noise(self.sigma(z, weights))
+        alone = dataclasses.replace(known, coordinates=c, counted=held, penalties={}, laws=(), watch=None, clock=None)
         if not alone.free.any() or not len(alone.rows[0]):
             return full
         best = alone.lowest(full[alone.free])
@@ -431,7 +471,8 @@ class Objective:
         if not np.isfinite(u).all():
             return np.inf, np.inf
         count, surprise = self.stacked.weight[rows[0]], self.surprises(u, rows[2]) + np.log(level)
-        return float(np.sqrt(np.average(u**2, weights=count))), float(np.sum(count * surprise))
+        scale = Colour.of(self.stacked, rows, self.rho).log_scale(np.sqrt(count))
+        return float(np.sqrt(np.average(u**2, weights=count))), float(np.sum(count * surprise)) + scale
 
     def surprises(self, u: Float[np.ndarray, " m"], output: Int[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """−ln of the density of residuals in units of the noise, times √(2π)."""

@@ -11,10 +11,11 @@ from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 
-from ..base.errors import ModelError, nearest
+from ..base.errors import ModelError, explained, nearest
 from ..run.system.parameters import ParameterNames
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class Normal:
     """A normal prior of a parameter, for `Problem(priors={"motor.R": Normal(1.2, 0.1)})`, with its standard deviation
@@ -30,6 +31,7 @@ class Normal:
             raise ModelError(f"Normal: spread is a standard deviation > 0; got {self.spread!r}")
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class LogNormal:
     """A normal prior of a parameter's logarithm, for `Problem(priors={"cell.tau": LogNormal(30.0, 2.0)})`: in two of

@@ -11,11 +11,15 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..base.errors import ModelError, SimulationError, explained_keywords
+from ..base.errors import ModelError, SimulationError, explained_keywords, keywords_of, whole_number, wrong_keyword
+from ..run.simulation.simulate import simulate
 from ..run.system.system import AcausalSystem
 from ..solve.methods.solve import check_tolerances, default_tolerances
 from .asked import METHODS, as_asked, check_start, checked_method, names_to_train, penalties, started
+from .beginnings import GROWING as GRADUAL
 from .beginnings import beginning, silent
+from .clock import Clock
+from .colour_search import correlated
 from .coordinates import Coordinate, Coordinates, coordinates
 from .data import Data, Stacked, stack
 from .descent import OFFSET, Minimum
@@ -32,6 +36,7 @@ from .priors import priors_by_name
 from .program import AbstractPredictor, Layout, Runs, Setting
 from .progress import reporter
 from .ranges import in_ranges
+from .resolution import resolved
 from .runs import residuals, run, why_not
 from .smoother import smoother
 from .starting_points import adam_steps, starting_points
@@ -42,6 +47,25 @@ GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
 # Starts of a network that follow where χ² is improbable: of four fits of Stribeck's friction, two end in a local
 # minimum, so that of three starts all do in one of eight.
 AGAIN = 2
+MORE = 4  # the same of parameters alone: of 30 records of two tanks, a third ended in a local minimum
+ENOUGH = 100  # evaluations of these, unless the search before took more: they cost no more than it did
+LONG = 60.0  # seconds that a search may take, so that others follow without being asked for
+ALIKE = 1e-3  # of −ln L, by which minima count as one
+
+
+# Options of `simulate` that a problem hands on: the others it gives itself.
+OPTIONS = tuple(
+    name for name in keywords_of(simulate)
+    if name not in ("system", "t1", "t0", "ts", "inputs", "initial", "adjoint", "throw")
+)  # fmt: skip
+ELSEWHERE = {
+    "inputs": "inputs= in each Experiment",
+    "initial": "initial= in each Experiment",
+    "sigma": "sigma= in each Experiment",
+    "noise": "sigma= in each Experiment, or method=Filter(noise)",
+    "bounds": "bounds= in fit",
+    "freeze": "freeze= in fit",
+}
 
 
 class Problem:
@@ -94,6 +118,9 @@ class Problem:
         mesh: Mesh | None = None,
         **options: Any,
     ):
+        for name in options:
+            if name not in OPTIONS:
+                raise ModelError(wrong_keyword("Problem", name, [*keywords_of(Problem.__init__), *OPTIONS], ELSEWHERE))
         if not isinstance(system, AcausalSystem):
             raise ModelError(f"Problem needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
         self.system = system
@@ -223,7 +250,7 @@ class Problem:
         start: "Mapping[str, float] | AcausalSystem | Training | None" = None,
         bounds: Mapping[str, tuple[float, float]] | None = None,
         first: GradientSteps | None = None,
-        starts: int = 1,
+        starts: int | None = None,
         seed: int = 0,
         adam: int = 0,
         learning_rate: float = 0.02,
@@ -231,6 +258,7 @@ class Problem:
         steps: int = 500,
         warn: bool = True,
         progress: Any = None,
+        timeout: float | None = None,
     ) -> Estimate:
         """Finds the most probable values, by least squares in units of the noise with the given priors.
 
@@ -242,10 +270,11 @@ class Problem:
             `train`.
         - `bounds`: narrower than those declared, by name.
         - `first`: steps of an Optax optimizer before least squares; `estimate.training` is their history.
-        - `starts`: the number of starting points. All but the first are drawn around it by `seed`: parameters within a
-            factor of e or their bounds, starts by their spread, networks with weights of the same sizes. The best
-            result is the one with the greatest likelihood of held-out experiments, or without any, and for a `Filter`,
-            of fitted ones.
+        - `starts`: the number of starting points; None: one, and where what it leaves over is no noise and its search
+            took less than a minute, up to four more, over growing shares of the time; of networks up to two. All but
+            the first are drawn around it by `seed`: parameters within a factor of e or their bounds, starts by their
+            spread, networks with weights of the same sizes. The best result is the one with the greatest likelihood of
+            held-out experiments, or without any, and for a `Filter`, of fitted ones.
         - `adam`: the number of gradient steps before least squares, with `learning_rate` on the scale of the
             coordinates.
         - `horizons`: shares of the record that are fitted one after the other, such as `(0.25, 0.5, 1)`, against runs
@@ -255,22 +284,25 @@ class Problem:
         - `warn`: whether a `FitWarning` gives the `reasons` if the estimate is not `ok`.
         - `progress`: True prints a line for each step: cost, χ²/n, what remains, seconds left. Or a function that is
             called with a `learning.Progress`.
+        - `timeout`: seconds, compilation included, after which no further step begins. Then, and after an interrupt
+            (Ctrl-C), the fit is that of the best point so far; its `message` says so.
 
         Without `start`, `first`, `adam` and `horizons`, networks begin at their own weights or with a last layer of
         zero, whichever is closer to the data. The weights of a raw `equinox.nn.MLP` are measured by the ranges of its
         inputs and the size of its outputs, so units do not matter. If both starts are far from the data, horizons grow.
-        If a network ends where χ² is improbable, up to two more drawn starts are tried.
-        If no step reduces the cost, the search measures the error of the integration, and tightens the tolerances if
-        that error is the cause.
+        At the minimum, the error of the integration is measured. If it counts beside the noise, the search goes on with
+        tighter tolerances; so it does if no step reduces the cost because of that error.
 
         **Raises:**
 
         - `ModelError` for names, values and shapes that do not fit.
         - `SimulationError` if no start can be simulated; the text gives the reason of the first.
         """
+        clock = Clock(timeout)
+        count = 1 if starts is None else whole_number(starts, "starts")
         objective = self._prepared(data, freeze, start, bounds)
-        objective = dataclasses.replace(objective, watch=reporter(progress, OFFSET))
-        if first is not None and (adam or (starts > 1 and first.checkpoint is not None)):
+        objective = dataclasses.replace(objective, watch=reporter(progress, OFFSET), clock=clock)
+        if first is not None and (adam or (count > 1 and first.checkpoint is not None)):
             other = "adam=" if adam else "a checkpoint with several starts"
             raise ModelError(f"first= does not go with {other}: leave one of them out")
         self._check_steps(adam, horizons, first)
@@ -281,36 +313,65 @@ class Problem:
         if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
         by_fit = isinstance(self.method, Filter) or not objective.stacked.holdout.any()
-        best: tuple[float, Objective, Minimum, Training | None] | None = None
         objective, own, fresh = in_ranges(
             objective, silent(objective, self._nominal(objective)), not isinstance(self.method, Shooting)
         )
-        more = AGAIN if plain and starts == 1 and not np.array_equal(silent(objective, own), own) else 0
-        points = starting_points(objective, own, fresh, starts + more, seed)
+        has_networks = not np.array_equal(silent(objective, own), own)
+        again = self._again(starts, has_networks, plain, first, adam)
+        points = starting_points(objective, own, fresh, count + again, seed)
+        best: tuple[float, Estimate] | None = None
+        tried, spent, most = 0, 0, np.inf  # evaluations, and how many more may follow
         for k, point in enumerate(points):
-            if k >= starts and best is not None and not best[1].is_improbable(best[2]):
+            if k == count:
+                again = again and clock.elapsed < LONG
+                most = np.inf if has_networks else spent + max(spent, ENOUGH)
+            is_enough = k >= count and not (again and spent < most)
+            if best is not None and (
+                clock.is_over or is_enough or (k >= count and not self._asks(best[1], has_networks))
+            ):
                 break
-            training, spans = None, shares
+            training, spans, tried = None, shares, k + 1
             if first is not None:
+                objective.stacked.check_white("first=")
                 training = train(objective, point, first)
                 point = training.z
             if plain:
                 point, spans = beginning(objective, point, point if k else fresh)
-            found = self._descend(objective, point, spans, steps, adam, learning_rate)
+            if k >= count and not has_networks:
+                # Over a short time, runs depend on numbers almost linearly: the first start, too, may lead elsewhere.
+                point, spans = (own if k == count else point), GRADUAL if shares == (1.0,) else shares
+            found = self._descend(objective, point, spans, int(min(steps, most - spent)), adam, learning_rate)
             if found is None:
                 continue
             here, lowest = found
+            spent += lowest.evaluations
             score = here.surprise(lowest) if by_fit else here.held_out(lowest.z, lowest.weights)[1]
-            if best is None or not score >= best[0]:
-                best = score, here, lowest, training
+            if best is None or score < best[0] - ALIKE:
+                best = score, self._estimate(here, lowest, training, steps)
         if best is None:
             raise SimulationError(why_not(objective))
-        _, here, lowest, training = best
-        here = dataclasses.replace(here, watch=None)
-        fit = Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
+        fit = dataclasses.replace(best[1], tried=tried)
         if warn and fit.reasons:
             warnings.warn(f"this fit is not to be relied on: {'; '.join(fit.reasons)}", FitWarning, stacklevel=3)
         return fit
+
+    def _asks(self, fit: Estimate, has_networks: bool) -> bool:
+        """True if a fit asks for other starts."""
+        return fit.objective.is_improbable(fit.minimum) if has_networks else fit.asks_for_starts
+
+    def _again(self, starts: int | None, has_networks: bool, plain: bool, first: Any, adam: int) -> int:
+        """How many more starts may follow where the fit asks for them."""
+        if starts is not None or first is not None or adam or self.method not in METHODS:
+            return 0
+        return (AGAIN if plain else 0) if has_networks else MORE
+
+    def _estimate(self, here: Objective, lowest: Minimum, training: Training | None, steps: int) -> Estimate:
+        """The estimate at a minimum, integrated as finely as the data ask for."""
+        assert here.clock is not None
+        if not isinstance(self.method, Shooting) and not here.clock.is_over:
+            here, lowest = resolved(here, lowest, steps)
+        here = dataclasses.replace(here, watch=None, clock=None)
+        return Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
 
     def train(
         self,
@@ -329,6 +390,7 @@ class Problem:
         if not isinstance(how, GradientSteps):
             raise ModelError(f"train takes learning.GradientSteps(optax.adam(0.02), steps=200); got {how!r}")
         self._check_steps(0, None, how)
+        (self._stacked if data is None else self.stacked(data)).check_white("train")
         objective = self._prepared(data, freeze, start, bounds)
         return train(objective, objective.coordinates.z_start[objective.free], how)
 
@@ -375,18 +437,20 @@ class Problem:
         if isinstance(self.method, Shooting):
             found = shoot(objective, self.method, point, steps, self._options["rtol"])
             return None if found is None else (objective, found)
-        found = None
+        found, evaluations = None, 0
         for share in shares:
             here = objective.until(share, silent(objective, point))
             if found is not None:
                 here = here.at_tolerance(found.tolerance)
             if adam and share == shares[0]:
                 point = adam_steps(here, point, adam, rate)
-            found = here.lowest(point, steps)
+            # Where time is over, the whole record is only looked at.
+            found = here.lowest(point, 0 if found is not None and here.clock and here.clock.is_over else steps)
             if found is None:
                 return None
-            point = found.z
+            point, evaluations = found.z, evaluations + found.evaluations
         assert found is not None
+        objective, found = correlated(objective, dataclasses.replace(found, evaluations=evaluations), steps)
         return smoother(objective, found, steps) or (objective, found)
 
     def reach(self, objective: Objective, start: np.ndarray, weights: Weights) -> Minimum | None:

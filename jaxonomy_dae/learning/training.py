@@ -13,7 +13,7 @@ import optax
 from jaxtyping import Float
 
 from ..base.aliases import PyTree
-from ..base.errors import ModelError, SimulationError, whole_number
+from ..base.errors import ModelError, SimulationError, explained, whole_number
 from ..base.optional import Axes, new_axes
 from ..host.content import content
 from .beginnings import silent
@@ -24,6 +24,7 @@ from .objective import Objective
 from .runs import why_not
 
 
+@explained
 @dataclasses.dataclass(frozen=True)
 class GradientSteps:
     """Settings of training by gradients, for `Problem.train(...)` and `Problem.fit(first=...)`.

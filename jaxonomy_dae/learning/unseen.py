@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..base.errors import ModelError, SimulationError
-from .data import Data
+from .data import Data, Stacked
 from .experiment import Experiment
 from .factors import Factors
 from .objective import Objective
@@ -57,7 +57,7 @@ class Unseen:
         if first is not None and (isinstance(first, bool) or not isinstance(first, int) or first < 1):
             raise ModelError(f"first is a number of rows ≥ 1, or None for all; got {first!r}")
         problem, fitted = estimate.problem, estimate.objective
-        stacked = problem.stacked(Data(experiment.changed(holdout=False, weight=1.0)))
+        stacked = with_noise_of(fitted, problem.stacked(Data(experiment.changed(holdout=False, weight=1.0))))
         c = problem.coordinates_of(fitted.setting._replace(layout=problem.layout_of(stacked)), stacked)
         known = estimate.values
         shared = [k for k in range(c.n_shared) if c.names[k] in known]
@@ -76,6 +76,7 @@ class Unseen:
         root[shared] = moves / c.slope(point)[shared][:, None]
         if not own.free.any():
             return cls(whole, point, root)
+        check_noise(own)
         found = own.lowest(point[own.free])
         if found is None:
             raise SimulationError(why_not(own))
@@ -98,15 +99,58 @@ class Unseen:
         return cls(whole, point, root)
 
     def score(self) -> Score:
-        """How well the samples are met."""
+        """How well the samples are met.
+
+        **Raises:**
+
+        - `ModelError` where neither the experiment nor the fit says how large the noise is.
+        """
         o = self.objective
+        check_noise(o)
         s, rows = o.stacked, o.rows
         u, level = o.standardized(self.point, {}, rows)
-        errors = u * level
+        errors = o.outputs(self.point)[rows] - s.values[rows]
         rms = {
             name: float(np.sqrt(np.mean(errors[rows[2] == j] ** 2)))
             for j, name in enumerate(s.outputs)
             if (rows[2] == j).any()
         }
         likelihood = -float(np.sum(o.surprises(u, rows[2]) + np.log(level) + 0.5 * np.log(2 * np.pi)))
+        likelihood -= o.colour.log_scale(np.ones(len(u)))
         return Score(rms, float(np.sqrt(np.mean(u**2))), likelihood)
+
+
+def with_noise_of(fit: Objective, new: Stacked) -> Stacked:
+    """New data, in which outputs whose experiment says nothing of their noise have that of the fit: its level, its
+    distribution and correlation, or the name of the level that was estimated. Levels that the fit has for each sample
+    go with its samples, and stay NaN."""
+    fitted = fit.stacked
+    sigma, level_of, tails, rho = np.array(new.sigma), list(new.level_of), np.array(new.tails), np.array(new.rho)
+    for j, name in enumerate(new.outputs):
+        if name not in fitted.outputs:
+            continue
+        k = fitted.outputs.index(name)
+        is_bare = new.level_of[j] == name and np.isinf(new.tails[j]).all() and np.all(new.unit[..., j] == 1)
+        is_silent = is_bare and np.isnan(new.sigma[..., j]).all()
+        rho[j] = fit.rho[k] if np.isnan(rho[j]) or (is_silent and rho[j] == 0) else rho[j]
+        if not is_silent:
+            continue
+        seen = fitted.observed[..., k]
+        levels, units = np.unique(fitted.sigma[..., k][seen]), np.unique(fitted.unit[..., k][seen])
+        if len(levels) == 1 and units.tolist() == [1.0]:
+            sigma[..., j], level_of[j], tails[j] = levels[0], fitted.level_of[k], fitted.tails[k]
+        else:
+            level_of[j] = ""
+    return dataclasses.replace(new, sigma=sigma, level_of=tuple(level_of), tails=tails, rho=np.nan_to_num(rho))
+
+
+def check_noise(objective: Objective) -> None:
+    """Refuses samples of which nothing says how large their noise is."""
+    s = objective.stacked
+    for j in np.unique(objective.rows[2]) if not objective.has_variances else ():
+        if np.isnan(s.sigma[..., j]).any():
+            why = "has another level for each sample or record" if s.level_of[j] == "" else "was not estimated"
+            raise ModelError(
+                f"the noise of '{s.outputs[j]}' {why} in the fit: say how large it is here, "
+                f"Experiment(…, sigma={{'{s.outputs[j]}': …}})"
+            )

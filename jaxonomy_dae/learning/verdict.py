@@ -6,17 +6,20 @@ What a fit leaves over is judged by one test (`leftover.py`), which doubts a rig
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import chdtr
 
 from ..compile.diagnosis.wording import listed
-from .leftover import LEVEL, Leftover
+from .causes import described
+from .held_out import missed
+from .leftover import BELOW, LEVEL, Leftover
 from .objective import AWAY
+from .resolution import EXACT, NOTICED
 
 if TYPE_CHECKING:
     from .estimate import Estimate
 
 SINGLE = 1e-2  # probability of a single test below which it is named, once all tests together doubt the model
-FAINT = 10.0  # times the integration's tolerance: residuals below are its error, which is never white
-BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
+FAINT = 10.0  # times the tolerance of an integration that cannot be finer: residuals below are its error
 
 
 class FitWarning(UserWarning):
@@ -26,36 +29,105 @@ class FitWarning(UserWarning):
 def reasons(fit: "Estimate") -> tuple[str, ...]:
     """What is against an estimate; nothing, if it is as it should be."""
     found = []
-    if not fit.minimum.converged:
-        found.append(f"{fit.message}: start elsewhere, with starts=5 or horizons=(0.1, 0.3, 1), or allow more steps=")
-    for check in (_leftover, _table):
+    if fit.message.startswith(("interrupted", "stopped by timeout")):
+        found.append(f"{fit.message}: go on from its point, fit(start=fit.values)")
+    elif not fit.minimum.converged:
+        found.append(f"{fit.message}: start elsewhere, with starts=10 or horizons=(0.1, 0.3, 1), or allow more steps=")
+    for check in (_resolution, _leftover, _held_out, _table):
         found.extend(check(fit))
     return tuple(found)
 
 
-def _leftover(fit: "Estimate") -> list[str]:
-    """What is left over, if it is not noise: all tests that say so, at least the one that says it most clearly."""
+def asks_for_starts(fit: "Estimate") -> bool:
+    """True if the search ended short of a minimum, ran away or against a bound, or left over what is no noise. Outliers
+    and noise levels that were stated too large are no reason to search elsewhere."""
+    notes = [row.note for row in fit.table()]
+    lost = any(note == "ran away" or note.startswith("bound reached") for note in notes)
+    return lost or not fit.minimum.converged or bool(_judged(fit)[1] & ({"χ²"} | COLOURS))
+
+
+def _judged(fit: "Estimate") -> tuple[Leftover, set[str]]:
+    """(what is left over, the tests that doubt it: where outliers are among them, those that do so without them)."""
     s = fit.objective.stacked
     pairs = [(label, name) for label, by in fit.residuals.items() for name in by if not _is_faint(fit, label, name)]
     left = Leftover.of(fit, [(s.labels.index(label), s.outputs.index(name)) for label, name in pairs])
     if left.probability > LEVEL:
-        return []
+        return left, set()
     named = {name for name, p in left.found.items() if p <= max(min(left.found.values()), SINGLE)}
+    if "outliers" in named and left.outliers.any():
+        named = {name for name in named if left.without_outliers[name] <= SINGLE} | {"outliers"}
+    return left, named
+
+
+def _leftover(fit: "Estimate") -> list[str]:
+    """What is left over, if it is not noise: all tests that say so, at least the one that says it most clearly."""
+    left, named = _judged(fit)
     said = []
+    if "outliers" in named and left.outliers.any():
+        said.append(_outliers(fit, left))
+    if "small χ²" in named:
+        said.extend(_overstated(fit, left))
     if "χ²" in named:
         chi2 = float(np.sum((left.share * left.scores)[left.known] ** 2))
+        why = (
+            f"the model lacks something{_elsewhere(fit)}"
+            if named & COLOURS
+            else f"sigma is stated {np.sqrt(chi2 / left.freedom):.2g} times too small, or what the model lacks looks "
+            "like noise. Give what the sensor has, or sigma='estimate'"
+        )
         said.append(
             f"χ² is {chi2:.4g} where noise of the given sigma makes it {left.freedom:.4g} ± "
-            f"{np.sqrt(2 * left.freedom):.2g}: the model lacks something, the search ended in a local minimum "
-            "(starts=5), or sigma is too small"
+            f"{np.sqrt(2 * left.freedom):.2g}: {why}"
         )
-    colours = [word for tests, words in COLOURS if named & tests for word in words(fit, left)]
-    if colours:
-        said.append(
-            f"residuals are not white noise: {', '.join(colours[:4])}. The model lacks something there, or noise is "
-            "correlated: intervals are too narrow, and those of fit.table(white=False) wider. Look at "
-            "fit.plot_residuals()"
-        )
+    if named & COLOURS:
+        said.append(_coloured(fit, left))
+    return said
+
+
+def _elsewhere(fit: "Estimate") -> str:
+    """What is to be said of local minima."""
+    if fit.tried > 1:
+        return f" ({fit.tried - 1} other starts ended no better)"
+    return ", or the search ended in a local minimum: try fit(starts=5)"
+
+
+def _coloured(fit: "Estimate", left: Leftover) -> str:
+    """What residuals look like, and what that speaks for."""
+    best, also = described(fit, left), _standing_out(fit, left)
+    clauses = [best.clause, *(clause for clause in also if "correlate" not in best.clause)]
+    return (
+        f"residuals are not white noise: {', '.join(clauses[:4])}. It may be that {best.speaks}. Until then "
+        "intervals are too narrow, those of fit.table(white=False) wider. Look at fit.plot_residuals()"
+    )
+
+
+def _outliers(fit: "Estimate", left: Leftover) -> str:
+    """Single samples that lie far out: how many of each output, and the furthest."""
+    s, (experiment, row, output) = fit.objective.stacked, fit.objective.rows
+    far = np.flatnonzero(left.outliers)
+    worst = far[np.argmax(np.abs(left.scores[far]))]
+    names = [s.outputs[j] for j in dict.fromkeys(output[far].tolist())]
+    k = experiment[worst]
+    where = f"t = {s.times[k, row[worst]]:.4g}{f' of {s.labels[k]}' if len(s.labels) > 1 else ''}"
+    return (
+        f"{len(far)} of {sum(map(len, left.by_output.values()))} samples are outliers, of {listed(names, 4)}, the "
+        f"furthest at {where}: estimates and noise levels follow them. Leave them out as NaN, or take them lightly, "
+        f"sigma={{'{s.outputs[output[worst]]}': learning.Noise(student=4)}}"
+    )
+
+
+def _overstated(fit: "Estimate", left: Leftover) -> list[str]:
+    """Outputs whose noise is less than was stated."""
+    said, output = [], fit.objective.rows[2]
+    for at, freedom in left.loose:
+        chi2 = float(np.sum((left.share * left.scores)[at] ** 2))
+        if chdtr(freedom, chi2) * len(left.loose) <= SINGLE:
+            name = fit.objective.stacked.outputs[output[at[0]]]
+            said.append(
+                f"χ² of '{name}' is {chi2:.4g} where noise of the given sigma makes it {freedom:.4g} ± "
+                f"{np.sqrt(2 * freedom):.2g}: sigma is stated {np.sqrt(freedom / chi2):.2g} times too large, and "
+                f"intervals are as much too wide. Give what the sensor has, or sigma={{'{name}': 'estimate'}}"
+            )
     return said
 
 
@@ -73,25 +145,7 @@ def _standing_out(fit: "Estimate", left: Leftover) -> list[str]:
     ]
 
 
-def _drifting(fit: "Estimate", left: Leftover) -> list[str]:
-    """The output that has the most power at low frequencies."""
-    name = fit.objective.stacked.outputs[left.slowest()]
-    several = len({one.output for one in left.series}) > 1
-    return [f"those of '{name}' and others drift slowly" if several else f"'{name}' drifts slowly"]
-
-
-def _following(fit: "Estimate", left: Leftover) -> list[str]:
-    """The output whose residuals follow a signal most clearly."""
-    output, signal = left.strongest_signal()
-    return [f"'{fit.objective.stacked.outputs[output]}' follows {signal}"]
-
-
-# Tests of `Leftover`, and what they say.
-COLOURS = (
-    ({"neighbours", "all neighbours", "peak", "common peak"}, _standing_out),
-    ({"slow"}, _drifting),
-    ({"signals"}, _following),
-)
+COLOURS = {"neighbours", "all neighbours", "peak", "common peak", "slow", "signals"}  # tests of form
 
 
 def _is_faint(fit: "Estimate", label: str, name: str) -> bool:
@@ -99,7 +153,34 @@ def _is_faint(fit: "Estimate", label: str, name: str) -> bool:
     s = fit.objective.stacked
     size = float(np.nanmax(np.abs(s.values[s.labels.index(label), :, s.outputs.index(name)]), initial=0.0))
     rms = float(np.sqrt(np.nanmean(fit.residuals[label][name] ** 2)))
-    return fit.rms[label][name] < FAINT * fit.minimum.tolerance * size or rms < BELOW
+    least = EXACT if fit.minimum.resolution <= NOTICED else max(EXACT, FAINT * fit.minimum.tolerance)
+    return fit.rms[label][name] < least * size or rms < BELOW
+
+
+def _resolution(fit: "Estimate") -> list[str]:
+    """The integration's error, if it counts beside the noise and could not be made less."""
+    error = fit.minimum.resolution
+    if not error > NOTICED or all(_is_faint(fit, label, name) for label, by in fit.residuals.items() for name in by):
+        return []
+    return [
+        f"errors of the integration move estimates by up to {error:.2g} of their standard deviations, and runs at a "
+        f"tolerance below {fit.minimum.tolerance:.0e} fail: allow more with max_steps=, or use method=Shooting() for "
+        "runs that diverge"
+    ]
+
+
+def _held_out(fit: "Estimate") -> list[str]:
+    """Experiments held out that are missed by more than noise and intervals explain."""
+    found = missed(fit.objective, fit.point, fit.root, fit.sigma, fit.freedom)
+    if not found:
+        return []
+    worst = max(found, key=lambda label: found[label][0] / found[label][1])
+    rms, expected = found[worst]
+    others = f", and {len(found) - 1} other experiments held out" if len(found) > 1 else ""
+    return [
+        f"'{worst}', which was held out, is missed by {rms:.3g} σ where noise and intervals make it {expected:.2g}"
+        f"{others}: what was fitted does not carry over. Fit it, too, by holdout=False, and look which residuals stay"
+    ]
 
 
 def _table(fit: "Estimate") -> list[str]:
@@ -110,8 +191,8 @@ def _table(fit: "Estimate") -> list[str]:
     away = [row.name for row in rows if row.note == "ran away"]
     if away:
         found.append(
-            f"nothing in the data keeps {listed(away, 6)} from running away, to {AWAY:.0e} times its start: begin "
-            "closer, freeze it, or give it a prior, priors=, or bounds="
+            f"nothing in the data keeps {listed(away, 6)} from running away, further than {AWAY:.0e} times its start: "
+            "begin closer, freeze it, or give it a prior, priors=, or bounds="
         )
     if ends:
         found.append(f"a bound was reached by {listed(ends, 6)}: widen bounds=, or look whether it should be there")

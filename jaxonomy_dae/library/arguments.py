@@ -100,8 +100,11 @@ def yes_or_no(value: Any, name: str, what: str) -> int:
 
 
 def start_of(
-    component: Component, name: str, given: Value | None, unit: str = "", guess: Value = 0.0
+    component: Component, name: str, given: Value | None, unit: str = "", guess: Value | None = 0.0
 ) -> dict[str, Any]:
-    """Options of a variable that starts at the parameter `name`: at the given value, or else near a guess."""
-    start = component.parameter(name, guess if given is None else given, unit=unit)
-    return dict(start=start, fixed=given is not None, unit=unit)
+    """Options of a variable that starts at the parameter `name`: at the given value, or else near a guess. Without
+    either the variable has no start, and there is no such parameter."""
+    value = guess if given is None else given
+    if value is None:
+        return dict(unit=unit)
+    return dict(start=component.parameter(name, value, unit=unit), fixed=given is not None, unit=unit)

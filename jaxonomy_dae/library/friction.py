@@ -9,6 +9,7 @@ import sympy
 from sympy import Abs, And, Max, Min, Ne, Piecewise, sign
 from sympy.logic.boolalg import Boolean
 
+from ..base.errors import ModelError
 from ..write import (
     NONNEGATIVE,
     POSITIVE,
@@ -46,9 +47,14 @@ def stick_slip(
     - `pressed`: what is positive while the parts are pressed together; None if they always are.
     """
     mode = component.discrete("mode", start=2, unit="1")
+    if str(speed) not in component.variables:
+        raise ModelError(
+            f"stick_slip: speed is a variable of component '{component.name}'; got {speed}: write a variable for it, "
+            "and an equation that says what it is"
+        )
     speed_unit = component.variables[str(speed)].unit
     still = component.parameter("standstill", STANDSTILL, unit=speed_unit, bounds=POSITIVE)
-    per = {"m/s": "1/kg", "rad/s": "rad/(kg*m*m)"}[speed_unit]
+    per = {"m/s": "1/kg", "rad/s": "rad/(kg*m*m)"}.get(speed_unit, "")  # of other speeds, units are not checked
     compliance = component.parameter("compliance", COMPLIANCE, unit=per, bounds=POSITIVE)
     stuck: Boolean = Eq(mode, 0)
     branch = Piecewise((0, Eq(mode, 2)), (mode * sliding, True))

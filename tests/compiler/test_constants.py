@@ -67,6 +67,7 @@ def test_what_counts_as_explained():
 METHODS = {
     "solve/events/search": "where an interval is cut, and where the search in it ends",
     "run/start/gauss_newton": "the least gain",
+    "run/start/guessed_point": "where the search begins and ends",
     "run/start/homotopy": "the shortest step along a curve",
     "graph/judgement/sparse_rank": "a shift for inverse iteration",
     "solve/linear/sparse": "what stands for a zero in a factorization",

@@ -33,7 +33,7 @@ from jaxonomy_dae import (
     pre,
     reinit,
     simulate,
-)
+)  # fmt: skip
 from jaxonomy_dae.library import signal
 from jaxonomy_dae.solvers import BDF, Rodas5P
 
@@ -192,27 +192,6 @@ def test_a_guard_that_meets_zero_flatly(flat):
     np.testing.assert_allclose(found["ball.h"][0], e**3 * w * s - 9.81 / 2 * s**2, rtol=1e-10)
     slope = jax.grad(lambda e: run(e)["ball.h"][0])(0.8)
     np.testing.assert_allclose(slope, 3 * e**2 * w * s + (e**3 * w - 9.81 * s) * by_e, rtol=1e-9)
-
-
-class Onto(Component):
-    """An event sets states from 5 to exactly 2, from where they rest, rise and fall; `n` and `strictly` count."""
-
-    def __init__(self, ev, name):
-        super().__init__(ev, name)
-        for then, rate in {"rests": 0, "rises": 1, "falls": -1}.items():
-            y, on = self.variable(f"y_{then}", start=5.0, fixed=True), self.discrete(f"on_{then}", start=0)
-            n, strictly = self.discrete(f"n_{then}", start=0), self.discrete(f"strictly_{then}", start=0)
-            self.add_equations(Eq(der(y), rate * on))
-            self.when(ev.t >= 0.5, reinit(y, 2.0), assign(on, 1))
-            self.when(y <= 2.0, assign(n, pre(n) + 1))
-            self.when(y < 2.0, assign(strictly, pre(strictly) + 1))
-
-
-@pytest.mark.slow
-def test_what_is_set_onto_a_level():
-    found = simulate(joined(Onto(EqnEnv(), "m")), 1.0, ts=jnp.array([1.0]))
-    counts = {then: (found[f"m.n_{then}"][0], found[f"m.strictly_{then}"][0]) for then in ("rests", "rises", "falls")}
-    assert counts == {"rests": (1, 0), "rises": (1, 0), "falls": (1, 1)}
 
 
 def test_accumulation_is_named():
@@ -503,3 +482,34 @@ def test_a_relay_and_a_lag():
     found = found[found < 3.0]
     np.testing.assert_allclose(found, first + half * np.arange(len(found)), atol=1e-8)
     assert len(found) == 1 + int((3.0 - first) / half)
+
+
+class Sampler(Component):
+    """q takes g·u at each tick, s adds it up, and x' = q."""
+
+    def __init__(self, ev, name, period):
+        super().__init__(ev, name)
+        u, g = self.input("u"), self.parameter("g", 1.0)
+        q, s = self.discrete("q", start=0.0), self.discrete("s", start=0.0)
+        x = self.variable("x", start=0.0, fixed=True)
+        self.add_equations(Eq(der(x), q))
+        self.when(self.sampled(period), assign(q, g * u), assign(s, pre(s) + g * u))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("period", [0.1, 1.0])
+def test_a_record_and_a_clock_that_tick_together(period):
+    """The held sample at a tick is the new one, however the times of both are rounded; and so are its derivatives."""
+    system, end, n = joined(Sampler(EqnEnv(), "c", period)), 2.0, round(2.0 / period) + 3
+    values = np.random.default_rng(0).normal(size=n)
+    ticks = np.minimum(period * np.arange(n), end)
+    for times in (period * np.arange(n), np.cumsum([0.0, *[period] * (n - 1)]), np.linspace(0, period * (n - 1), n)):
+
+        def run(values, times=times):
+            given = {"c.u": (times, values, "held")}
+            solution = simulate(system, end, ts=jnp.array([end]), inputs=given)
+            return jnp.stack([solution["c.x"][0], solution["c.s"][0]])
+
+        weights = np.stack([np.diff(ticks, append=end), (period * np.arange(n) < end + 1e-9).astype(float)])
+        np.testing.assert_allclose(run(jnp.asarray(values)), weights @ values, atol=1e-6)
+        np.testing.assert_allclose(jax.jit(jax.jacrev(run))(jnp.asarray(values)), weights, atol=1e-6)

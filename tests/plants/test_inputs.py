@@ -371,7 +371,7 @@ class Wide(eqx.Module):
         (([0.0, np.inf], [0.0, 1.0]), r"'m\.u': times\[1\] is inf"),
         (([0.0, 10.0], np.ones((2, 2))), r"'m\.u': values must be real numbers of shape \(n,\)"),
         (([0.0, 10.0], np.ones(2) * 1j), r"'m\.u': values must be real numbers of shape \(n,\); got complex128"),
-        (([0.0, 10.0], np.ones(2), "quadratic"), r"samples are 'linear', 'cubic' or 'held'; got 'quadratic'"),
+        (([0.0, 10.0], np.ones(2), "quadratic"), r"samples are 'linear', 'spline', 'cubic' or 'held'; got 'quadratic'"),
         (([0.0, 9.0], np.ones(2)), r"samples of input 'm\.u' reach from 0 to 9, the run from 0 to 10"),
         (([1.0, 10.0], np.ones(2), "held"), r"reach from 1 to 10, the run from 0 to 10"),
         (
@@ -392,7 +392,7 @@ def test_inputs_that_cannot_be_read(lag, given, message):
 def test_unknown_inputs_and_wrong_tables(lag, rate):
     with pytest.raises(ModelError, match=r"'m\.v' is not an input of this system: did you mean 'm\.u'"):
         simulate(lag, 10.0, inputs={"m.v": 1.0})
-    with pytest.raises(ModelError, match=r"differentiates input 'm\.u' once: held samples.*Give 'cubic'"):
+    with pytest.raises(ModelError, match=r"differentiates input 'm\.u' once: held samples.*Give 'spline'"):
         simulate(rate, 1.0, inputs={"m.u": PULSE})
     for jumps, message in ((jnp.ones((2, 2)), r"shape \(2, 2\)"), (math.nan, "must be finite")):
         with pytest.raises(ModelError, match="jump_ts " + message if "finite" in message else message):

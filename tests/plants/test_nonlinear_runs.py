@@ -49,7 +49,7 @@ def test_a_turning_point_is_named(solver):
 
 @pytest.mark.slow
 def test_saved_times_at_which_a_block_has_no_solution():
-    """z² = u, u negative in a pulse that the steps pass over: the saved value there was a number. A run ends at such a row."""
+    """z² = u, u negative in a pulse that the steps pass over: the saved value there was a number. A run ends there."""
     system = implicit(lambda x, u, z: [z**2 - u], 1.0, 1.0)
     pulse = {"m.u": lambda t: jnp.where(jnp.abs(t - 0.7) < 1e-3, -1.0, 1.0)}
     options = dict(ts=np.array([0.5, 0.7, 1.0]), inputs=pulse, solver=Rodas5P())

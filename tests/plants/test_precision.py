@@ -33,11 +33,10 @@ from jaxonomy_dae import Component, EqnEnv, ModelError, assign, der, linearize, 
 
 system = pendulum(drag_on("vx"))
 assert system.parameters.array.dtype == jnp.float32
-for given in (dict(t1=1.0, rtol=1e-6), dict(t0=1.7e9, t1=1.7e9 + 5.3)):  # the second one is shorter than a spacing
-    try:
-        simulate(system, **given)
-    except ModelError as error:
-        print(error)
+try:
+    simulate(system, 1.0, rtol=1e-6)
+except ModelError as error:
+    print(error)
 ts = np.array([0.5, 1.0, 1.5], np.float32)
 plain = simulate(system, 1.5, ts=ts)
 solution = simulate(system, 1.5, ts=ts, rtol=1e-4, atol=1e-6)
@@ -105,13 +104,7 @@ def test_single_precision_works_with_loose_tolerances(single):
 
 @pytest.mark.slow
 def test_single_precision_explains_why_tolerances_are_out_of_reach(single):
-    for part in (
-        "rtol=1e-06",
-        "float32",
-        "jax_enable_x64",
-        "rtol ≥ 2e-06",
-        "times near 1.7e+09 are 2e+02 apart in float32",
-    ):
+    for part in ("rtol=1e-06", "float32", "jax_enable_x64", "rtol ≥ 2e-06"):
         assert part in single
 
 

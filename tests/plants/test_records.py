@@ -266,7 +266,9 @@ def test_sensors_share_a_level_and_errors_grow_with_what_is_measured():
     with pytest.raises(ModelError, match="the noise of 'c.x' has tails, which method=Shooting does not take"):
         learning.Problem(system(Falling), other, train=["c.a"], method=learning.Shooting(2)).fit()
     mixed = learning.Data(data, learning.Experiment(TS, {"c.x": x}, sigma=0.1))
-    with pytest.raises(ModelError, match="experiment 1: the noise of 'c.x' has another distribution or shared level"):
+    with pytest.raises(
+        ModelError, match="experiment 1: the noise of 'c.x' has another distribution, correlation or shared level"
+    ):
         learning.Problem(system(Falling), mixed, train=["c.a"])
 
 

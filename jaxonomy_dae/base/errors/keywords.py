@@ -10,6 +10,7 @@ from .wrong_values import nearest
 
 P = ParamSpec("P")
 R = TypeVar("R")
+Class = TypeVar("Class", bound=type)
 NOWHERE: Mapping[str, str] = {}
 
 
@@ -30,9 +31,9 @@ def explained_keywords(elsewhere: Mapping[str, str] = NOWHERE) -> Callable[[Call
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
             for name in kwargs:
                 if name not in known:
-                    raise ModelError(
-                        wrong_keyword(function.__qualname__.removesuffix(".__init__"), name, known, elsewhere)
-                    )
+                    is_method = function.__name__ == "__init__"
+                    where = type(args[0]).__name__ if is_method else function.__qualname__
+                    raise ModelError(wrong_keyword(where, name, known, elsewhere))
             return function(*args, **kwargs)
 
         return call
@@ -40,10 +41,17 @@ def explained_keywords(elsewhere: Mapping[str, str] = NOWHERE) -> Callable[[Call
     return decorate
 
 
+def explained(cls: Class) -> Class:
+    """A class whose construction refuses unknown keywords as `explained_keywords` does."""
+    cls.__init__ = explained_keywords()(cls.__init__)
+    return cls
+
+
 def keywords_of(function: Callable[..., Any]) -> list[str]:
-    """The names that a function can be given arguments by."""
+    """The names that a function can be given arguments by, except for private ones."""
     kinds = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return [n for n, p in inspect.signature(function).parameters.items() if p.kind in kinds and n != "self"]
+    named = [n for n, p in inspect.signature(function).parameters.items() if p.kind in kinds]
+    return [n for n in named if n not in ("self", "cls") and not n.startswith("_")]
 
 
 def wrong_keyword(where: str, name: str, known: list[str], elsewhere: Mapping[str, str] = NOWHERE) -> str:

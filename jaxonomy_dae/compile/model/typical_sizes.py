@@ -44,8 +44,21 @@ def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndar
     values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
     quantity, value = model.variables.quantity[v], values[v] / model.variables.factor[v]
     tells = np.isfinite(value) & (value != 0.0) & (size[quantity] == 0.0)
+    tells &= ~_lost_beside_others(values[v], model.flat.variables.unit, v)
     np.maximum.at(size, quantity[tells], np.abs(value[tells]))
     return size
+
+
+def _lost_beside_others(values: np.ndarray, units: list[str], variables: np.ndarray) -> np.ndarray:
+    """True for starts that rounding would lose beside the largest one of the same unit: an angle of 1e-16 among angles
+    of 1, computed outside of the model, is zero."""
+    sizes = np.where(np.isfinite(values), np.abs(values), 0.0)
+    small = (sizes > 0) & (sizes <= KNOWN * sizes.max(initial=0.0))
+    lost = np.zeros(len(variables), bool)
+    for unit in {units[k] for k in variables[small].tolist()} - {""}:
+        same = np.array([units[k] == unit for k in variables.tolist()])
+        lost |= same & (sizes <= KNOWN * sizes[same].max())
+    return lost
 
 
 class _Balance:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ...base.errors import ModelError, whole_number
+from ...base.errors import ModelError, explained_keywords, whole_number
 from .network import Sizes, divided, each, multiplied, sizes, tanh_network
 
 
@@ -18,6 +18,7 @@ class _Scaled(eqx.Module):
     inputs: tuple[float, ...] = eqx.field(static=True)
     outputs: tuple[float, ...] = eqx.field(static=True)
 
+    @explained_keywords()
     def __init__(self, in_size: int = 1, out_size: int = 1, *, key: PRNGKeyArray, width: int = 8, depth: int = 2,
                  inputs: Sizes = 1.0, outputs: Sizes = 1.0):  # fmt: skip
         law = type(self).__name__

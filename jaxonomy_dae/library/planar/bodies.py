@@ -3,6 +3,7 @@
 from sympy import cos, sin
 
 from ...write import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Planar, Value, der
+from ..arguments import start_of
 from .joints import TwoFrames
 
 
@@ -44,7 +45,7 @@ class Body(Component):
         `initial_speed` (radian per second): they hold at the start where they are given.
     - `guess_x`, `guess_y`, `guess_angle`: where the search for a start begins for what is not given; the parameters
         `initial_x`, … are then the guesses. A closed loop has several positions in which it fits together, and the
-        guesses choose among them.
+        guesses choose among them. A position or angle with neither has no start, and no such parameter.
     """
 
     def __init__(
@@ -61,9 +62,9 @@ class Body(Component):
         initial_vx: Value | None = None,
         initial_vy: Value | None = None,
         initial_speed: Value | None = None,
-        guess_x: Value = 0.0,
-        guess_y: Value = 0.0,
-        guess_angle: Value = 0.0,
+        guess_x: Value | None = None,
+        guess_y: Value | None = None,
+        guess_angle: Value | None = None,
     ):
         super().__init__(ev, name)
         mass = self.parameter("m", m, unit="kg", bounds=POSITIVE)
@@ -71,9 +72,8 @@ class Body(Component):
         gx, gy = self.parameter("g_x", g_x, unit="m/s2"), self.parameter("g_y", g_y, unit="m/s2")
         frame = self.port("frame", Planar)
 
-        def state(name: str, unit: str, initial: Value | None, guess: Value = 0.0):
-            start = self.parameter(f"initial_{name}", guess if initial is None else initial, unit=unit)
-            return self.variable(name, start=start, fixed=initial is not None, unit=unit)
+        def state(name: str, unit: str, initial: Value | None, guess: Value | None = 0.0):
+            return self.variable(name, **start_of(self, f"initial_{name}", initial, unit, guess))
 
         x, vx = state("x", "m", initial_x, guess_x), state("vx", "m/s", initial_vx)
         y, vy = state("y", "m", initial_y, guess_y), state("vy", "m/s", initial_vy)
@@ -150,9 +150,9 @@ class MassiveLink(Component):
         g_y: Value = -9.81,
         initial_angle: Value | None = None,
         initial_speed: Value | None = None,
-        guess_x: Value = 0.0,
-        guess_y: Value = 0.0,
-        guess_angle: Value = 0.0,
+        guess_x: Value | None = None,
+        guess_y: Value | None = None,
+        guess_angle: Value | None = None,
     ):
         super().__init__(ev, name)
         frame_a, frame_b = self.port("frame_a", Planar), self.port("frame_b", Planar)

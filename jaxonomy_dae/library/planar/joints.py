@@ -41,7 +41,8 @@ class Revolute(TwoFrames):
 
     - `initial_angle` (radian), `initial_speed` (radian per second): they hold at the start where they are given.
     - `guess_angle` (radian): where the search for a start begins if `initial_angle` is not given. In a closed loop it
-        chooses among the positions in which the loop fits together.
+        chooses among the positions in which the loop fits together. Without either the angle has no start, and there is
+        no parameter `initial_angle`: nothing that was not said outweighs what was.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Revolute(TwoFrames):
         name: str,
         initial_angle: Value | None = None,
         initial_speed: Value | None = None,
-        guess_angle: Value = 0.0,
+        guess_angle: Value | None = None,
     ):
         super().__init__(ev, name)
         a, b = self._two_frames()
@@ -84,6 +85,7 @@ class Prismatic(TwoFrames):
     - `angle`: of the axis in frame_a (radian).
     - `initial_position` (metre), `initial_velocity` (metre per second): they hold at the start where they are given.
     - `guess_position` (metre): where the search for a start begins if `initial_position` is not given.
+        Without either the position has no start, and there is no parameter `initial_position`.
     """
 
     def __init__(
@@ -93,7 +95,7 @@ class Prismatic(TwoFrames):
         angle: Value = 0.0,
         initial_position: Value | None = None,
         initial_velocity: Value | None = None,
-        guess_position: Value = 0.0,
+        guess_position: Value | None = None,
     ):
         super().__init__(ev, name)
         inclination = self.parameter("angle", angle, unit="rad")

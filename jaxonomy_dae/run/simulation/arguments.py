@@ -151,21 +151,25 @@ def _concrete(value: object) -> np.ndarray | None:
     return None if isinstance(value, Tracer) else np.asarray(value, float)
 
 
+def _check_length(t0: float, t1: float, dtype: np.dtype) -> None:
+    """Raises a `ModelError` if numbers of this type hardly tell the times of a run apart."""
+    largest = max(abs(t0), abs(t1))
+    if t1 - t0 > RESOLUTION * float(np.finfo(dtype).eps) * largest:
+        return
+    double = 'use double precision, jax.config.update("jax_enable_x64", True), or ' if dtype == np.float32 else ""
+    raise ModelError(
+        f"the interval from t0={t0!r} to t1={t1!r} is too short for {dtype.name}, in which times near {largest:g} are "
+        f"{float(np.spacing(dtype.type(largest))):g} s apart: {double}count time from the start, t0=0.0"
+    )
+
+
 def _check_interval(t0, t1, ts, dtype):
     check_finite(t0=t0, t1=t1)
     a, b = _concrete(t0), _concrete(t1)
     if a is not None and b is not None and not a < b:
         raise ModelError(f"the interval needs t0 < t1; got t0={float(a)}, t1={float(b)}")
     if a is not None and b is not None:
-        spacing = float(np.finfo(dtype).eps * max(abs(a), abs(b)))
-        if b - a < RESOLUTION * spacing:
-            is_single = dtype == np.float32
-            double = ', or use double precision: jax.config.update("jax_enable_x64", True)' if is_single else ""
-            raise ModelError(
-                f"times near {float(b):g} are {spacing:.2g} apart in {dtype}: a run from t0={float(a)} to "
-                f"t1={float(b)} has too few of them to step through. Count time from the beginning of the run, "
-                f"t0=0.0{double}"
-            )
+        _check_length(float(a), float(b), np.dtype(dtype))
     if ts is None:
         return
     if np.ndim(ts) != 1 or not np.shape(ts)[0]:

@@ -109,8 +109,9 @@ def simulate(
     - `rtol`, `atol`: tolerances of the local error, by default 1e-6 and 1e-8 (1e-4 and 1e-6 in single precision);
         `atol` is multiplied by the nominal values of the states. A state without a nominal value has the size that
         follows from starts and equations, if that is below one.
-    - `inputs`: by the inputs' names: constants; samples `(times, values)`, interpolated linearly, or with `"cubic"` or
-        `"held"` as a third entry; `diffrax.LinearInterpolation` and `diffrax.CubicInterpolation`; functions of time.
+    - `inputs`: by the inputs' names: constants; samples `(times, values)`, interpolated linearly, or with `"spline"`,
+        `"cubic"` or `"held"` as a third entry; `diffrax.LinearInterpolation` and `diffrax.CubicInterpolation`;
+        functions of time.
         Steps end at the times of samples. A function reads variables of its surroundings when `simulate` is called.
     - `initial`: values at `t0` by variables' names. They replace the starts declared in components. Or the whole state
         of another run, `solution.at(k)`: this run continues from it, with its discrete variables, modes and clocks, and

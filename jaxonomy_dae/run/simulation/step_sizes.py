@@ -7,11 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from ...base.aliases import Args, Controller, Numeric, Solver, State, Time, Times, Tolerance
 from ...base.errors import ModelError
 from ...host.staging import is_traced, joined, on_device
-from ...solve.adjoint.ends import ending
+from ...solve.adjoint.ends import End, ending
 from ...solve.adjoint.resting import still
 from ...solve.methods.solve import step_control
 from ...solve.methods.step_control import UNSEEN, ConstantLengths
@@ -20,6 +21,8 @@ from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .controlled_variables import with_variables
 from .wave_control import AtWaves
+
+HERE = 8  # roundings, within which two times are one
 
 
 def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Tolerance:
@@ -60,8 +63,27 @@ def clipped(controller: Controller, jump_ts: Times, ends: StepEnds) -> Controlle
     jumps = ends.jumps if jump_ts is None else [jump_ts, *ends.jumps]
     if not jumps and not ends.kinks:
         return controller
-    times = [joined(ts) if ts else None for ts in (jumps, ends.kinks)]
-    return diffrax.ClipStepSizeController(ending(controller, ConstantLengths()), step_ts=times[1], jump_ts=times[0])
+    controller = ending(controller, ConstantLengths(), *([AtTimes(jnp.sort(joined(ends.kinks)))] if ends.kinks else []))
+    return diffrax.ClipStepSizeController(controller, jump_ts=joined(jumps)) if jumps else controller
+
+
+class AtTimes(End):
+    """Steps end at each of these times, increasing. `diffrax.ClipStepSizeController` does the same, but carries them
+    from step to step: of 40,000 samples, each step then copied them all, and a run took 25 times as long."""
+
+    ts: Float[Array, " n"]
+
+    def wrap(self, direction: Time) -> "AtTimes":
+        """The same for a run in the direction of time 1 or −1."""
+        return AtTimes(jnp.sort(self.ts * direction))
+
+    def moved(self, start: Time, end: Time) -> Time:
+        """The end of a step, or the first of the times if that is before it. Times within rounding of the start have
+        passed: where another input jumps at one of them, a step ends just before the jump."""
+        passed = start + HERE * jnp.finfo(start.dtype).eps * jnp.abs(start)
+        k = jnp.searchsorted(self.ts, jax.lax.stop_gradient(passed), side="right")
+        ahead = jnp.where(k < len(self.ts), self.ts[jnp.minimum(k, len(self.ts) - 1)], jnp.inf)
+        return jnp.minimum(end, ahead.astype(end.dtype))
 
 
 def first_step(

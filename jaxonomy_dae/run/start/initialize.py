@@ -32,7 +32,7 @@ from .explicit import Substitution, substitution
 from .given_solver import find_root_with
 from .initial_values import check_initial
 from .ladder import FAILED, STAGED, Found, find_root
-from .problem import InitialProblem, bounds_of, independent_rows
+from .problem import InitialProblem, bounds_of, chooses, guessed_from, independent_rows
 from .rows import InitialRows, initial_rows
 from .search import Look
 from .sizes import Sizes, column_sizes, row_sizes, weighed
@@ -130,6 +130,8 @@ def _searched(problem: InitialProblem, solver: Any) -> Found:
     staged = None if len(problem.unknown) else stages(plan, rows)
     if staged is not None:
         start = jax.lax.stop_gradient(solve_in_stages(problem.function, start, sizes, *staged))
+    if problem.chooses:
+        start = jax.lax.stop_gradient(guessed_from(plan, rows, problem.look_at_guesses, start, problem.typical))
     if solver is not None:
         square = core is not None or not rows.n_soft
         return find_root_with(solver, problem.function, start, sizes, problem.is_soft, square, problem.magnitude)
@@ -180,7 +182,7 @@ def _look(system, t0, inputs, initial, solve_for: tuple[str, ...], w: Any) -> _L
     """The rows at w; at the start where w is not-a-number."""
     problem = InitialProblem(system, t0, inputs, initial, solve_for)
     w = jnp.where(jnp.all(jnp.isnan(w)), problem.start, w)
-    return _Looked(w, problem.sizes, problem.typical, problem.look(w))
+    return _Looked(w, problem.sizes, problem.typical, (problem.look_at_guesses if problem.chooses else problem.look)(w))
 
 
 _compiled_look = compiled(_look)
@@ -211,14 +213,22 @@ def search_outside(
         return None
     first = jax.device_get(first)
 
-    def look(w: Any) -> Look:
+    def look_at_all(w: Any) -> Look:
         return first.rows if np.array_equal(w, first.w) else jax.device_get(looked(w).rows)
 
-    m = len(first.rows.value)
+    m = plan.n_constraints + len(plan.carried) + len(rows.kept)
+
+    def look(w: Any) -> Look:
+        value, jacobian, terms = look_at_all(w)
+        return Look(value[:m], jacobian[:m], None if terms is None else terms[:m])
+
     soft = np.arange(m) >= m - rows.n_soft
     core, bounds = independent_rows(plan, rows, n), bounds_of(plan, len(unknown))
     with np.errstate(all="ignore"):  # what is not finite is a rung's failure, as in a program
-        root = find_root(look, m, first.w, first.sizes, core, soft=soft, bounds=bounds, typical=first.typical)
+        start = first.w
+        if chooses(plan, rows):
+            start = guessed_from(plan, rows, look_at_all, start, first.typical)
+        root = find_root(look, m, start, first.sizes, core, soft=soft, bounds=bounds, typical=first.typical)
     return jax.tree.map(on_device, root)
 
 

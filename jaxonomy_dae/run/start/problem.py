@@ -14,14 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from ...base.tolerances import CLOSE, NOISE
+from ...base.tolerances import CLOSE, KNOWN, NOISE
 from ...compile.lowering.gather import Gather, take, times
 from ...compile.lowering.plan import SystemPlan
 from ...compile.model.declared import declared_scale, quantity_bounds
+from ...solve.linear.choice import DENSE_UPTO
 from ..system.nonlinear import Refinement
 from ..system.system_at import SystemAt
+from .guessed_point import guessed_point
 from .ladder import looking
 from .rows import InitialRows, StartRow, initial_rows
+from .search import Look
 from .sizes import Sizes
 
 PERTURBATIONS = 8  # of the start, and of parameters, that show the sizes of terms
@@ -53,14 +56,18 @@ class InitialProblem:
         self._given = [initial[n] for n in names] if initial else []
         self.point: SystemAt = system.at(t0, inputs)
         parameters, dtype = self.point.parameters, self.point.dtype
-        both = (*rows.kept, *rows.guess)
+        both = (*rows.kept, *rows.guess, *rows.hints)
         values, sizes = start_values(both, self._given, parameters)
+        n_hints = len(rows.hints)
+        values, hinted = jnp.split(values, [len(both) - n_hints])
+        sizes, self._sizes_of_hints = jnp.split(sizes, [len(both) - n_hints])
         # From a unit of each row's variable to its quantity.
         units = jnp.asarray([1.0 if row is None else 1.0 / (row.factor or 1.0) for row in rows.guess], dtype)
         kept = len(rows.kept)
         self.target, self.data = values[:kept], sizes[:kept]
         self.x0 = values[kept:] * units
         self.starts, self._sizes_of_starts = _reader(plan, rows.kept)
+        self.hinted, (self._hints, _) = jax.lax.stop_gradient(hinted), _reader(plan, rows.hints)
         self.n_equations = plan.n_constraints + len(plan.carried)
         self.m = self.n_equations + kept
         self.moving = parameters, inputs, self.target
@@ -78,6 +85,8 @@ class InitialProblem:
         nominal = jnp.append(self._nominal, jnp.asarray(more, dtype))
         guess = jnp.append(sizes[kept:] * jnp.abs(units), jnp.asarray(more, dtype))
         known = jnp.maximum(jnp.maximum(guess, jnp.abs(self.start)), nominal)
+        # A guess that is rounding, as π − 3.14159…, says nothing of a size.
+        known = jnp.where((known > 0) & (known <= KNOWN * self.typical), self.typical, known)
         data = jnp.concatenate([jnp.zeros((self.n_equations,), dtype), self.data])
         self.sizes = frozen(Sizes(nominal, known, data, _distances(plan, rows, data)))
         if self.m > len(self.start):
@@ -124,6 +133,23 @@ class InitialProblem:
         return looking(self.function, self.magnitude)(w)
 
     @property
+    def chooses(self) -> bool:
+        """True if declared guesses may choose among solutions: more of them than the equations leave open."""
+        return chooses(self.plan, self.rows)
+
+    def look_at_guesses(self, w: Any) -> Look:
+        """The rows at a point, those of guesses that the others determine at the end."""
+
+        def function(w: Any) -> Any:
+            here = self._at(*self.settings[:2], w)
+            return jnp.append(self.function(w), self._hints(here, w[: self.plan.n_state]) - self.hinted)
+
+        def magnitude(w: Any) -> Any:
+            return jnp.append(self.magnitude(w), jnp.abs(self.hinted))
+
+        return looking(function, magnitude)(w)
+
+    @property
     def core(self) -> np.ndarray | None:
         """As `independent_rows`."""
         return independent_rows(self.plan, self.rows, self.plan.n_state + len(self.unknown))
@@ -137,6 +163,22 @@ class InitialProblem:
     def alone(self) -> np.ndarray:
         """True for rows that do not follow from those before them, shape (m,)."""
         return np.append(np.ones(self.n_equations, bool), self.rows.independent)
+
+
+def chooses(plan: SystemPlan, rows: InitialRows) -> bool:
+    """True if declared guesses may choose among solutions: more of them than the equations leave open."""
+    shares = rows.n_soft and not all(rows.independent[-rows.n_soft :])
+    return not rows.direct and plan.n_state <= DENSE_UPTO and bool(rows.hints or shares)
+
+
+def guessed_from(plan: SystemPlan, rows: InitialRows, look: Any, start: Any, typical: Any) -> Any:
+    """As `guessed_point`, of rows that end with `rows.hints`."""
+    n_equations, n_more = plan.n_constraints + len(plan.carried), len(start) - plan.n_state
+    is_start = np.append(np.zeros(n_equations, bool), np.ones(len(rows.kept) + len(rows.hints), bool))
+    undeclared = [k for k, row in enumerate(rows.kept, n_equations) if row.start is None and row.given < 0]
+    counts = np.ones(len(is_start), bool)
+    counts[undeclared] = False
+    return guessed_point(look, start, typical, is_start, counts, bounds_of(plan, n_more))
 
 
 def bounds_of(plan: SystemPlan, n_unknown: int) -> np.ndarray:

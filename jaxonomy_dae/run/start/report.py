@@ -123,6 +123,12 @@ class InitializationReport(Sections):
             if rows.kept[k].quantity not in entries:
                 guess = float(self._target[k])
                 out.append(Guess(rows.kept[k].name, guess, guess + float(moved[k])))
+        others = [row for row in rows.hints if row.quantity not in entries]
+        if others:
+            names = [row.name for row in others]
+            values = np.asarray(self._system.observe(names, self.time, self._found.x, self._inputs), float)
+            given = [0.0 if row.start is None else row.start.value(parameters) for row in others]
+            out += [Guess(*guess) for guess in zip(names, given, values.tolist(), strict=True)]
         for k, q in enumerate(entries):
             if q in held:
                 continue

@@ -69,6 +69,7 @@ class InitialRows:
     unshared: tuple[
         str, ...
     ] = ()  # guesses that gave way to others, where there are too many unknowns for a compromise
+    hints: tuple[StartRow, ...] = ()  # declared guesses that others determine: they choose among solutions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +153,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
         )  # fmt: skip
     generic = _generic(plan, solve_for)
     judge = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
-    closes, follows, soft, unshared = judge(plan, generic, rows, ranks or _ranks(plan, guess, others))
+    closes, follows, soft, unshared, hints = judge(plan, generic, rows, ranks or _ranks(plan, guess, others))
     # What the caller gave outranks other starts, unless these follow whatever is given.
     is_dropped = [
         bool(overrides) and r.given < 0 and not c and not f for r, c, f in zip(rows, closes, follows, strict=True)
@@ -168,6 +169,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
         settled=tuple(place for place, k in enumerate(kept) if follows[k]),
         dropped=tuple(row.name for row, gone in zip(rows, is_dropped, strict=True) if gone),
         unshared=unshared,
+        hints=hints,
     )
 
 
@@ -301,12 +303,14 @@ def _are_states(ranks: Sequence[_Rank], states: set[int]) -> bool:
 
 class _Judged(NamedTuple):
     """Of rows that must hold, those that close a direction, and those that follow from equations alone; guesses, and
-    whether each closes a direction; guesses that gave way, though they should share."""
+    whether each closes a direction; guesses that gave way, though they should share; declared guesses that rows before
+    theirs determine."""
 
     closes: list[bool]
     follows: list[bool]
     soft: list[tuple[StartRow, bool]]
     unshared: tuple[str, ...] = ()
+    hints: tuple[StartRow, ...] = ()
 
 
 class _Directions:
@@ -352,6 +356,8 @@ def _by_rank(plan: SystemPlan, generic: _Generic, hard: Sequence[StartRow], rank
     follows = [not directions.open(generic.row(row)) for row in hard]
     closes = [directions.close(generic.row(row)) for row in hard]
     soft: list[tuple[StartRow, bool]] = []
+    hints: list[StartRow] = []
+    held, order = {row.quantity for row in hard}, plan.extended.quantities.order
     for rank in ranks:
         gradients = [generic.row(dataclasses.replace(row, start=None)) for row in rank.rows]
         undecided = [directions.open(gradient) for gradient in gradients]
@@ -359,10 +365,15 @@ def _by_rank(plan: SystemPlan, generic: _Generic, hard: Sequence[StartRow], rank
             alone = is_open and directions.close(gradient)
             if alone or (is_open and rank.shares):
                 soft.append((row, alone))
+            # Derivatives of constraints are linear in what has the highest order: there is nothing to choose.
+            elif (
+                rank.shares and not is_open and gradient.any() and row.quantity not in held and not order[row.quantity]
+            ):
+                hints.append(row)
     if generic.solve_for:
         redundant = [row for row, alone in zip(hard, closes, strict=True) if not alone]
         _check_count(plan, generic, directions, redundant, [*hard, *(row for row, _ in soft)])
-    return _Judged(closes, follows, soft)
+    return _Judged(closes, follows, soft, hints=tuple(hints))
 
 
 def _by_matching(plan: SystemPlan, generic: _Generic, hard: Sequence[StartRow], ranks: Sequence[_Rank]) -> _Judged:

@@ -23,9 +23,11 @@ from ...compile.model.array_names import regular_shape, wrong_shape
 from ...host.staging import as_array, is_traced, on_device
 from ...write.networks import uses_numpy, why_untraceable
 from .closed_function import ClosedFunction, closed_function
+from .splines import natural_spline
 
-KINDS = ("linear", "cubic", "held")
-EXAMPLE = "inputs={'m.u': (times, values)}, or (times, values, 'held') or 'cubic'"
+KINDS = ("linear", "spline", "cubic", "held")
+CURVED = ("spline", "cubic")  # whose slopes follow from several samples
+EXAMPLE = "inputs={'m.u': (times, values)}, or (times, values, 'held') or 'spline'"
 
 
 class HeldPath(eqx.Module):
@@ -41,7 +43,7 @@ class HeldPath(eqx.Module):
 
 class SampledInput(eqx.Module):
     """An interpolated input. Its derivatives up to order `smoothness` are continuous: 0 for linear interpolation, 1 for
-    cubic, −1 for samples that are held."""
+    causal cubic curves, 2 for splines, −1 for samples that are held."""
 
     path: Any
     smoothness: int = eqx.field(static=True)
@@ -206,7 +208,7 @@ def _function(name: str, function: Callable[[Any], Any], dtype: Any, allowed: tu
 def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: tuple[int, ...]) -> SampledInput:
     kind = given[2] if len(given) == 3 else "linear"
     if kind not in KINDS:
-        raise ModelError(f"input '{name}': samples are 'linear', 'cubic' or 'held'; got {kind!r}")
+        raise ModelError(f"input '{name}': samples are 'linear', 'spline', 'cubic' or 'held'; got {kind!r}")
     times = _column(name, "times", given[0], dtype)
     for_each = shape and len(regular_shape(given[1]) or ()) > 1
     values = _column(name, "values", given[1], dtype, shape if for_each else ())
@@ -222,6 +224,8 @@ def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: t
         return SampledInput(HeldPath(times, values), -1)
     if kind == "linear":
         return SampledInput(diffrax.LinearInterpolation(times, values), 0)
+    if kind == "spline":
+        return SampledInput(natural_spline(times, values), 2)
     return SampledInput(diffrax.CubicInterpolation(times, diffrax.backward_hermite_coefficients(times, values)), 1)
 
 
@@ -334,8 +338,8 @@ def step_ends(plan: SystemPlan, inputs: Mapping[str, Any]) -> StepEnds:
         places = plan.input_places(name)
         highest = 0 if places is None else plan.inputs.highest(places)
         if highest > value.smoothness + 1:
-            kind = {-1: "held", 0: "linear", 1: "cubic"}[value.smoothness]
-            better = "'cubic'" if highest <= 2 else "a smooth function of time"
+            kind = {-1: "held", 0: "linear", 1: "cubic", 2: "spline"}[value.smoothness]
+            better = "'spline'" if highest <= 3 else "a smooth function of time"
             raise ModelError(
                 f"the model differentiates input '{name}' {_times(highest)}: {kind} samples do not have that "
                 f"derivative at their times. Give {better}"

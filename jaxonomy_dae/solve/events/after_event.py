@@ -165,15 +165,16 @@ def _sides(
     # conditions wait until they leave zero: modes of a system at rest would turn for ever.
     equal = zero & (rate == 0) & (armed == ABOVE) & ~here & problem.facts.true_at_zero
     equal = equal & (relations[c:] | jnp.asarray(relations)[event])
-    # What an event sets exactly onto a level, from clearly above it, is there, wherever it goes then.
-    equal = equal | ((value == 0) & (armed == ABOVE) & ~here & ~reached & problem.facts.true_at_zero & ~relations[c:])
-    stays = (left[c:] & now.onto & (value == 0)) | equal
+    # A condition whose guard was above zero, and which an event set onto it, is true if it is not strict.
+    landed = zero & (armed == ABOVE) & ~here & ~reached & (jnp.abs(value) <= band)
+    landed = landed & (now.moved | (left[c:] & instant.caused)) & problem.facts.true_at_zero & ~relations[c:]
+    stays = (left[c:] & now.onto & (value == 0)) | equal | landed
     true = jnp.where(zero, ((falling * arrival.span < -band) & ~now.waits) | stays, value < 0)
     was_armed = ((armed > 0) & ~here) | (turns_back & (event >= c)) | (now.rose & ~here)
     # What this event made true happens next. A pending event still happens, even if a state was set anew: unless the
     # new values make its condition false, or it is revocable and undone.
     stands = left[c:] & ~problem.facts.are(EventFlag.REVOCABLE)[c:] & reached
-    caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & (~zero | equal)
+    caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & (~zero | equal | landed)
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     rests = was_armed | left[c:] | (falling * arrival.span > band)  # an event that was undone may happen later
     side = jnp.where(zero, jnp.where(rests, RESTS, BELOW), ABOVE)

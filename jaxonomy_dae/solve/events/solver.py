@@ -121,7 +121,8 @@ class WithEvents(WrappedSolver):
             return handle(problem, t1, state, arrival, args, noted)
 
         if problem.facts.only_kinks:
-            y1, slope = turned(problem, t1, state, values, arrival.due, args), jnp.zeros_like(x1)
+            then, _ = problem.at_instant(args)
+            y1, slope = turned(problem, t1, state, values, arrival.due, then), jnp.zeros_like(x1)
         else:
             y1, slope, noted = lax.cond(any_member(fired), events, lambda state: (state, *none), state)
             # The branch is taken if any member of a batch has an event; the others keep their states.
