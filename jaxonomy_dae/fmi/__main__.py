@@ -57,7 +57,7 @@ def _validate(asked: argparse.Namespace) -> int:
     try:
         problems = validate_fmu(str(asked.file))
     except Exception as error:  # FMPy raises what its readers of zip files and XML raise
-        problems = [str(error)]
+        problems = [f"FMPy could not read it: {type(error).__name__}: {error}"]
     for problem in problems:
         print(f"{asked.file}: {problem}", file=sys.stderr)
     if not problems:

@@ -45,10 +45,8 @@ def test_sources_become_a_binary_that_runs(tmp_path, capsys):
 def test_files_that_are_no_such_fmus_are_named(tmp_path, capsys):
     text, bare, odd = (tmp_path / name for name in ("text.fmu", "bare.fmu", "odd.fmu"))
     text.write_text("no zip")
-    for path, build in (
-        (bare, None),
-        (odd, '<b><BuildConfiguration modelIdentifier="../m"><S/></BuildConfiguration></b>'),
-    ):
+    named = '<b><BuildConfiguration modelIdentifier="../m"><SourceFile name="m.c"/></BuildConfiguration></b>'
+    for path, build in (bare, None), (odd, named):
         with zipfile.ZipFile(path, "w") as file:
             file.writestr("modelDescription.xml", "<a/>")
             if build:
