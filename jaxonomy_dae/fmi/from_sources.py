@@ -1,6 +1,7 @@
 """Binaries for an FMU, made of the C sources that it holds."""
 
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -35,7 +36,7 @@ def add_binaries(path: Path, platforms: Sequence[str] = ()) -> list[str]:
     try:
         with zipfile.ZipFile(path) as file:
             contents = {name: file.read(name) for name in file.namelist() if not name.endswith("/")}
-    except zipfile.BadZipFile as error:
+    except (zipfile.BadZipFile, zlib.error) as error:
         raise ModelError(f"'{path}' is damaged: {error}") from None
     identifier, source = _build(path, contents)
     try:
