@@ -101,11 +101,11 @@ def export_fmu(
         ending = TARGETS.get(name, ("", ".so"))[1]
         library = shared_library(command, name, files, SOURCE)
         contents[f"binaries/{name}/{identifier}{ending}"] = library
-    target.write_bytes(_zipped(contents))
+    target.write_bytes(zipped(contents))
     return target
 
 
-def _zipped(contents: dict[str, bytes]) -> bytes:
+def zipped(contents: dict[str, bytes]) -> bytes:
     """A zip file without times, in the order of names."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as file:
