@@ -241,6 +241,8 @@ def _rows(given: Given, begin: _Start, parts: _Parts, done: Run) -> _Rows:
         memory, last = Memory.of(parts.problem, saved, marks, end.size), (last[0], end.x)
     x = jnp.asarray(x)
     filled = jnp.isfinite(saved)
+    if parts.problem is not None:  # nothing is known at the instant at which two events contradict each other
+        filled = filled & ((done.last[1].stuck >= -1) | (saved < last[0]) | (saved == t0))
     if parts.problem is not None and ts is not None:
         filled = filled & (parts.goes_on | (ts == t0))
     okay = diffrax.is_okay(done.result)
