@@ -14,7 +14,7 @@ from .export import zipped
 def add_binaries(path: Path, platforms: Sequence[str] = ()) -> list[str]:
     """Compiles the sources of an FMU and puts the binaries into it; what else is in it stays.
 
-    **Parameters:**
+    **Arguments:**
 
     - `path`: an FMU of FMI 3.0 whose build needs one C file, its neighbours, and no settings, as `export_fmu`
         writes it.

@@ -28,7 +28,6 @@ from jaxonomy_dae import (
     EqnEnv,
     ModelError,
     SimulationError,
-    assign,
     der,
     pre,
     reinit,
@@ -482,34 +481,3 @@ def test_a_relay_and_a_lag():
     found = found[found < 3.0]
     np.testing.assert_allclose(found, first + half * np.arange(len(found)), atol=1e-8)
     assert len(found) == 1 + int((3.0 - first) / half)
-
-
-class Sampler(Component):
-    """q takes g·u at each tick, s adds it up, and x' = q."""
-
-    def __init__(self, ev, name, period):
-        super().__init__(ev, name)
-        u, g = self.input("u"), self.parameter("g", 1.0)
-        q, s = self.discrete("q", start=0.0), self.discrete("s", start=0.0)
-        x = self.variable("x", start=0.0, fixed=True)
-        self.add_equations(Eq(der(x), q))
-        self.when(self.sampled(period), assign(q, g * u), assign(s, pre(s) + g * u))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("period", [0.1, 1.0])
-def test_a_record_and_a_clock_that_tick_together(period):
-    """The held sample at a tick is the new one, however the times of both are rounded; and so are its derivatives."""
-    system, end, n = joined(Sampler(EqnEnv(), "c", period)), 2.0, round(2.0 / period) + 3
-    values = np.random.default_rng(0).normal(size=n)
-    ticks = np.minimum(period * np.arange(n), end)
-    for times in (period * np.arange(n), np.cumsum([0.0, *[period] * (n - 1)]), np.linspace(0, period * (n - 1), n)):
-
-        def run(values, times=times):
-            given = {"c.u": (times, values, "held")}
-            solution = simulate(system, end, ts=jnp.array([end]), inputs=given)
-            return jnp.stack([solution["c.x"][0], solution["c.s"][0]])
-
-        weights = np.stack([np.diff(ticks, append=end), (period * np.arange(n) < end + 1e-9).astype(float)])
-        np.testing.assert_allclose(run(jnp.asarray(values)), weights @ values, atol=1e-6)
-        np.testing.assert_allclose(jax.jit(jax.jacrev(run))(jnp.asarray(values)), weights, atol=1e-6)

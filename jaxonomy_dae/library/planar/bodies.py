@@ -72,12 +72,13 @@ class Body(Component):
         gx, gy = self.parameter("g_x", g_x, unit="m/s2"), self.parameter("g_y", g_y, unit="m/s2")
         frame = self.port("frame", Planar)
 
-        def state(name: str, unit: str, initial: Value | None, guess: Value | None = 0.0):
-            return self.variable(name, **start_of(self, f"initial_{name}", initial, unit, guess))
+        def state(name: str, unit: str, initial: Value | None, guess: Value | None = 0.0, word: str | None = None):
+            return self.variable(name, **start_of(self, f"initial_{word or name}", initial, unit, guess))
 
         x, vx = state("x", "m", initial_x, guess_x), state("vx", "m/s", initial_vx)
         y, vy = state("y", "m", initial_y, guess_y), state("vy", "m/s", initial_vy)
-        phi, omega = state("phi", "rad", initial_angle, guess_angle), state("omega", "rad/s", initial_speed)
+        phi = state("phi", "rad", initial_angle, guess_angle, "angle")
+        omega = state("omega", "rad/s", initial_speed, word="speed")
         self.add_equations(
             Eq(x, frame.x),
             Eq(y, frame.y),

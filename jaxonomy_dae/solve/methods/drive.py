@@ -102,12 +102,12 @@ def _short_of_jumps(of: Integration, t1: Time) -> tuple[Integration, Time]:
     jumps = [c.jump_ts for c in held if _clips(c) and c.jump_ts is not None]
     if not jumps:
         return of, t1
-    moved = jnp.nextafter(t1, of.t0) - t1
     at_end = jnp.any(jnp.stack([jnp.any(jnp.asarray(ts) == t1) for ts in jumps]))
-    short = t1 + jax.lax.stop_gradient(jnp.where(at_end, moved, 0.0))
+    moved = jax.lax.stop_gradient(jnp.where(at_end, jnp.nextafter(t1, of.t0) - t1, 0.0))
+    short = t1 + moved
     if of.save.ts is None:
         return of, short
-    inside = jnp.where(of.save.ts == t1, short, of.save.ts)
+    inside = of.save.ts + jnp.where(of.save.ts == t1, moved, 0.0)  # derivatives by the times stay theirs
     return of._replace(save=dataclasses.replace(of.save, ts=inside)), short
 
 
