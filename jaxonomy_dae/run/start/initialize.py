@@ -35,7 +35,7 @@ from .ladder import FAILED, STAGED, Found, find_root
 from .problem import InitialProblem, bounds_of, chooses, guessed_from, independent_rows
 from .rows import InitialRows, initial_rows
 from .search import Look
-from .sizes import Sizes, column_sizes, row_sizes, weighed
+from .sizes import Sizes, column_sizes, row_sizes, terms_of, weighed
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
 
@@ -160,7 +160,7 @@ def _substituted(problem: InitialProblem, order: Substitution) -> Found:
         x, _ = jax.lax.scan(lambda w, _: (w - over * problem.function(w)[order.row], None), start, length=order.levels)
     at = problem.look(x)
     measured = sizes._replace(nominal=sizes.nominal / unit, known=sizes.known / unit)
-    unit = unit * column_sizes(at.value, at.jacobian * unit, measured)
+    unit = unit * column_sizes(terms_of(at.value, at.terms), at.jacobian * unit, measured)
     size, noise = row_sizes(weighed(at.jacobian), x, sizes, unit, at.terms)
     limit = solved(start.dtype) * size + noise
     holds = jnp.all(jnp.abs(at.value) <= limit) & jnp.all(jnp.isfinite(at.jacobian))
