@@ -22,7 +22,7 @@ from ...base.tolerances import solved
 from ...compile.lowering.plan import SystemPlan
 from ...host.cache import PROGRAMS, compiled
 from ...host.platform import precisely
-from ...host.staging import is_staged, is_traced, on_device
+from ...host.staging import as_argument, is_staged, is_traced
 from ...solve.linear.dense import least_squares
 from ...solve.linear.newton import twice
 from ...solve.linear.sparse import sparse_jacobian
@@ -206,7 +206,7 @@ def search_outside(
     n, dtype = plan.n_state + len(unknown), system.parameters.values.dtype
 
     def looked(w: Any) -> Any:
-        return _compiled_look(system, t0, inputs, initial, solve_for, on_device(w))
+        return _compiled_look(system, t0, inputs, initial, solve_for, as_argument(w))
 
     first = looked(np.full(n, np.nan, dtype))
     if is_traced(first):  # a network may close over a traced value
@@ -229,7 +229,7 @@ def search_outside(
         if chooses(plan, rows):
             start = guessed_from(plan, rows, look_at_all, start, first.typical)
         root = find_root(look, m, start, first.sizes, core, soft=soft, bounds=bounds, typical=first.typical)
-    return jax.tree.map(on_device, root)
+    return jax.tree.map(as_argument, root)
 
 
 def known_start(system: Any, t0: Any, inputs: Any, initial: Mapping[str, Any] | None) -> InitialPoint | None:
@@ -370,8 +370,8 @@ def find_initial(
         raise ModelError(f"t0 must be a time, a number; got {t0!r}. Values at the start go to initial={{...}}")
     check_initial(system, initial)
     inputs = read_inputs(system.plan, dtype, inputs)
-    initial = {name: on_device(v, dtype) for name, v in sorted((initial or {}).items())}
-    arguments = (system.without_stiffness, on_device(t0, dtype), inputs, initial, solve_for)
+    initial = {name: as_argument(v, dtype) for name, v in sorted((initial or {}).items())}
+    arguments = (system.without_stiffness, as_argument(t0, dtype), inputs, initial, solve_for)
     if not is_staged(arguments):
         begun = search_outside(*arguments) if solver is None else None
         found = _compiled(*arguments, solver, begun)
