@@ -81,7 +81,8 @@ def _array(leaf: Any) -> Any:
     if isinstance(leaf, jax.Array):
         return leaf
     fits = isinstance(leaf, np.ndarray) and jax.dtypes.canonicalize_dtype(leaf.dtype) == leaf.dtype
-    return leaf if fits and jax.config.jax_default_device is None else jnp.asarray(leaf)
+    config: Any = jax.config
+    return leaf if fits and config.jax_default_device is None else jnp.asarray(leaf)
 
 
 def options() -> list[tuple[str, object]]:
