@@ -139,3 +139,15 @@ def test_the_core_is_what_its_page_says():
         assert abs(lines - int(said.replace(",", ""))) <= 0.05 * lines, f"{lines} lines, the page says {said}: {files}"
         total += lines
     assert 5_000 < total < 10_500
+
+
+def test_whether_a_value_is_known_is_asked_in_one_place():
+    """`host/staging.py` asks it; rooms that compute do not look at JAX' tracers themselves."""
+    asking = [
+        "/".join(name)
+        for name, tree in modules().items()
+        if name[0] in ("solve", "run", "learning", "analysis")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module == "jax.core" and "Tracer" in {a.name for a in node.names}
+    ]
+    assert not asking
