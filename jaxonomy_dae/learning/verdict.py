@@ -55,7 +55,8 @@ def _judged(fit: "Estimate") -> tuple[Leftover, set[str]]:
         return left, set()
     named = {name for name, p in left.found.items() if p <= max(min(left.found.values()), SINGLE)}
     if "outliers" in named and left.outliers.any():
-        named = {name for name in named if left.without_outliers[name] <= SINGLE} | {"outliers"}
+        # A fit follows outliers: how large the noise is shows once they are left out.
+        named = {name for name in named & COLOURS if left.without_outliers[name] <= SINGLE} | {"outliers"}
     return left, named
 
 
