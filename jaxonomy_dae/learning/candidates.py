@@ -157,7 +157,7 @@ def inputs(model: Linearized, fit: "Estimate") -> Iterator[Change]:
     b = (model.along.by_input[:, 1:] + model.along.by_input[:, :-1]) / 2
     for p, name in enumerate(model.inputs):
         times, values = s.inputs[name]
-        kind = dict(s.kinds)[name]
+        times, kind = times + fit.values.get(f"delay of {name}", 0.0), dict(s.kinds)[name]
 
         def read(at: np.ndarray, times=times, values=values, kind=kind) -> np.ndarray:
             return np.stack([sampled(*one, kind) for one in zip(at, times, values, strict=True)])

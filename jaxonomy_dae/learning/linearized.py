@@ -23,7 +23,7 @@ from ..run.system.inputs import read_inputs, value_at
 from .filter_steps import Model, read, slopes_of
 from .linear_models import linear_flow
 from .objective import Objective
-from .program import Conditions, Own, Owns, Setting, Shared, placed, run_end, with_kinds
+from .program import Conditions, Own, Owns, Setting, Shared, delays_of, placed, run_end, with_kinds
 
 
 class Along(NamedTuple):
@@ -48,7 +48,7 @@ def _one(setting: Setting, shared: Shared, own: Own, c: Conditions) -> Along:
     layout, plan, dtype = setting.layout, setting.system.plan, c.times.dtype
     f = len(plan.states)
     here, laws, initial = placed(setting, shared, own, c.known)
-    inputs = with_kinds(c.inputs, layout)
+    inputs = with_kinds(c.inputs, layout, delays_of(layout, shared))
     times = jnp.concatenate([c.t0[None], c.times])
     solution = simulate(
         here, run_end(c.t0, c.times[-1]), t0=c.t0, ts=times, initial=initial or None, inputs=inputs,
