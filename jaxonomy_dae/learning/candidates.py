@@ -26,12 +26,14 @@ EDGE = 4  # samples on each side of a step
 TAKEN = 1e-4  # of a column's square, below which the model's own numbers take it up
 DAY = 86400.0  # s
 TURNS = 0.02  # of its size, that a state must be beyond zero on both sides
+FORM = 4  # coefficients of a polynomial that stands for a law of another form
 DAYS = 2  # in a record, from which a daily disturbance is looked for
 
 SLOW = (
     "something slow acts that was not measured: let the equations err, method=learning.Filter(noise), or make it a "
     "parameter of each record"
 )
+BENT = "what it passes through saturates, has a dead zone, or is not linear"
 DAILY = "what comes and goes with the day (sun, people, tariffs) is missing: give it as an input"
 
 
@@ -105,8 +107,26 @@ def laws(model: Linearized) -> Iterator[Change]:
                 kinds[f"with the sign of '{name}'"] = np.sign(own), jump
                 kinds[f"with '{name}' times its size"] = own * np.abs(own), drag
             columns = model.answers(i, np.stack([between(term) for term, _ in kinds.values()], axis=-1))
+            powers = own[..., None] ** np.arange(FORM)
+            yield Change(
+                f"{_slope(model, i)} lacks a curve over '{name}'",
+                f"the law of '{name}' is not linear where the model's is, or has another form",
+                model.answers(i, between(powers)), FORM,
+            )  # fmt: skip
             for k, (what, (_, speaks)) in enumerate(kinds.items()):
                 yield Change(f"{_slope(model, i)} lacks a term {what}", speaks, columns[:, [k]], 1)
+
+
+def readings(model: Linearized, fit: "Estimate") -> Iterator[Change]:
+    """Outputs that are not linear in a state where the model's are, or have another form."""
+    experiment, row, output = model.rows
+    at = model.along.states[experiment, row + 1]
+    for j in np.unique(output):
+        shown = fit.objective.stacked.outputs[j]
+        for k, name in enumerate(model.states):
+            speaks = f"'{shown}' is another function of '{name}' than in the model"
+            powers = at[:, [k]] ** np.arange(FORM) * (output == j)[:, None]
+            yield Change(f"'{shown}' lacks a curve over '{name}'", speaks, powers, FORM)
 
 
 def disturbances(model: Linearized) -> Iterator[Change]:
@@ -127,23 +147,25 @@ def disturbances(model: Linearized) -> Iterator[Change]:
 
 
 def _switches(model: Linearized, i: int, where: str, constant: np.ndarray) -> Iterator[Change]:
-    """Constants that begin within a record."""
-    experiments = np.unique(model.rows[0])
-    for e in experiments:
+    """Constants, and terms in proportion to a state, that begin within a record."""
+    own = model.along.states[..., i]
+    always = model.answers(i, between(own)[..., None])[:, 0]
+    for e in np.unique(model.rows[0]):
         count = int(np.max(model.rows[1][model.rows[0] == e])) + 1
         places = np.unique(np.linspace(EDGE, count - EDGE, PLACES).astype(int)) if count > 2 * EDGE else []
         if not len(places):
             continue
-        terms = np.zeros((*model.times[:, 1:].shape, len(places)))
+        from_then = np.zeros((*model.times[:, 1:].shape, len(places)))
         for k, place in enumerate(places):
-            terms[e, place:, k] = 1.0
-        columns = model.answers(i, terms)
+            from_then[e, place:, k] = 1.0
+        pushes = model.answers(i, from_then), model.answers(i, between(own)[..., None] * from_then)
         for k, place in enumerate(places):
-            at = model.times[e, place]
+            at = f"from t = {model.times[e, place]:.4g} on"
+            speaks = f"something was switched, or broke, near t = {model.times[e, place]:.4g}: look what happened"
+            yield Change(f"{where} a constant {at}", speaks, np.stack([constant, pushes[0][:, k]], axis=1), 3)
             yield Change(
-                f"{where} a constant from t = {at:.4g} on",
-                f"something was switched near t = {at:.4g} that the model does not know: look what happened",
-                np.stack([constant, columns[:, k]], axis=1), 3,
+                f"{where} a term in proportion to '{model.states[i]}' {at}", speaks,
+                np.stack([always, pushes[1][:, k]], axis=1), 3,
             )  # fmt: skip
 
 
@@ -163,18 +185,21 @@ def inputs(model: Linearized, fit: "Estimate") -> Iterator[Change]:
             return np.stack([sampled(*one, kind) for one in zip(at, times, values, strict=True)])
 
         u, before = read(inside), read(inside - late)
+        low, high = np.quantile(u, [0.25, 0.75])
         terms = {
             "acts by another gain": (u, "its gain differs from the model's"),
             "is late": (before - u, "it passes through something that delays it, or its times are shifted"),
             "has an offset": (np.ones_like(u), "it has a bias"),
-            "does not act in proportion": (u**2, "what it passes through saturates, or is not linear"),
+            "does not act in proportion": (u**2, BENT),
+            "saturates": (np.maximum(u - high, 0.0), BENT),
+            "has a dead zone": (np.minimum(u - low, 0.0), BENT),
         }
         means = np.stack([w.mean(axis=-1) for w, _ in terms.values()], axis=-1)
         columns = model.moved(np.einsum("enfg,eng,enq->enfq", model.along.gathered, b[..., p], means))
         for k, (what, (_, why)) in enumerate(terms.items()):
             yield Change(
                 f"the input '{name}' {what}", f"the input '{name}' acts otherwise than the model says: {why}",
-                columns[:, [k]], 1,
+                columns[:, [k]], 2 if why == BENT else 1,
             )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .candidates import DAILY, DAY, EDGE, SLOW, WIDEST, Change, Judge, disturbances, inputs, laws
+from .candidates import DAILY, DAY, EDGE, SLOW, WIDEST, Change, Judge, disturbances, inputs, laws, readings
 from .leftover import FINE, Leftover, Series, periodogram
 from .linearized import Linearized
 from .program import Runs
@@ -20,6 +20,8 @@ from .program import Runs
 if TYPE_CHECKING:
     from .estimate import Estimate
 
+CLOSE = 6.0  # in units of 2 ln L, below which evidence is not strong (Kass & Raftery 1995, J. Am. Stat. Ass. 90:773)
+RIVALS = 3  # descriptions that are said
 DRIFTS = 2  # half waves of a drift, beside a constant
 LIKE_A_DAY = 0.05  # relative: by how much a period may miss a day in a record of some days
 
@@ -50,17 +52,23 @@ class Description(NamedTuple):
     speaks: str
 
 
-def described(fit: "Estimate", left: Leftover) -> Description:
-    """The best description of the residuals."""
+def described(fit: "Estimate", left: Leftover) -> list[Description]:
+    """The best description of the residuals, and those that speak for something else of which the data hardly say that
+    they are worse."""
     judge = Judge.of(fit, left)
     kinds = [_signals(fit, left), _steps(fit, left, judge), _waves(fit, left, judge)]
     if isinstance(fit.objective.predictor, Runs) and len(fit.system.plan.states) <= WIDEST:
         model = Linearized.of(fit.objective, fit.point)
         if model is not None:
-            kinds += [laws(model), inputs(model, fit), disturbances(model)]
+            kinds += [laws(model), readings(model, fit), inputs(model, fit), disturbances(model)]
     found = [_correlations(fit, left, judge)]
     found += [_weighed(judge, list(kind)) for kind in kinds]
-    return max((one for kind in found for one in kind), key=lambda one: one.worth)
+    by_worth = sorted((one for kind in found for one in kind), key=lambda one: -one.worth)
+    rivals: dict[str, Description] = {}
+    for one in by_worth:
+        if one.worth > by_worth[0].worth - CLOSE:
+            rivals.setdefault(one.speaks, one)
+    return list(rivals.values())[:RIVALS]
 
 
 def _weighed(judge: Judge, changes: Sequence[Change]) -> list[Description]:

@@ -94,11 +94,12 @@ def _elsewhere(fit: "Estimate") -> str:
 
 def _coloured(fit: "Estimate", left: Leftover) -> str:
     """What residuals look like, and what that speaks for."""
-    best, also = described(fit, left), _standing_out(fit, left)
-    clauses = [best.clause, *(clause for clause in also if "correlate" not in best.clause)]
+    found, also = described(fit, left), _standing_out(fit, left)
+    clauses = [found[0].clause, *(clause for clause in also if "correlate" not in found[0].clause)]
+    rivals = "".join(f"; or, hardly less likely, {one.clause}: {one.speaks}" for one in found[1:])
     return (
-        f"residuals are not white noise: {', '.join(clauses[:4])}. It may be that {best.speaks}. Until then "
-        "intervals are too narrow, those of fit.table(white=False) wider. Look at fit.plot_residuals()"
+        f"residuals are not white noise: {', '.join(clauses[:4])}. It may be that {found[0].speaks}{rivals}. Until "
+        "then intervals are too narrow, those of fit.table(white=False) wider. Look at fit.plot_residuals()"
     )
 
 
