@@ -203,7 +203,7 @@ def inputs(model: Linearized, fit: "Estimate") -> Iterator[Change]:
             )  # fmt: skip
 
 
-def between(at: Any) -> Float[np.ndarray, "e n"]:
+def between(at: Any) -> Float[np.ndarray, "e n *q"]:
     """Means from each time to the next."""
     return (at[:, 1:] + at[:, :-1]) / 2
 
