@@ -219,6 +219,11 @@ def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: t
     if times.shape[0] < least:
         raise ModelError(f"input '{name}': {kind} samples are at least {least}; got {times.shape[0]}")
     _check_times(name, times)
+    return interpolated(times, values, kind)
+
+
+def interpolated(times: Float[Array, " n"], values: Float[Array, " n *shape"], kind: str) -> SampledInput:
+    """Samples as an input of a kind."""
     if kind == "held":
         return SampledInput(HeldPath(times, values), -1)
     if kind == "linear":
