@@ -389,6 +389,7 @@ class Estimate:
 
         return sample(self, draws, chains, warmup, seed)
 
+    @explained_keywords()
     def filtered(
         self, names: str | Sequence[str], experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
@@ -399,12 +400,14 @@ class Estimate:
         """
         return self._followed(names, experiment, "filtered", 1, level)
 
+    @explained_keywords()
     def smoothed(
         self, names: str | Sequence[str], experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
         """As `filtered`, but from all samples of the experiment, including later ones (Rauch, Tung & Striebel 1965)."""
         return self._followed(names, experiment, "smoothed", 1, level)
 
+    @explained_keywords()
     def ahead(
         self, names: str | Sequence[str], steps: int = 1, experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
@@ -447,6 +450,7 @@ class Estimate:
         """
         return discover(self, name, terms, width, most)
 
+    @explained_keywords()
     def plot(
         self, names: str | Sequence[str] | None = None, *, axes: AxesGiven = None, level: float = 0.95
     ) -> np.ndarray:

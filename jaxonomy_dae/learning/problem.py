@@ -122,9 +122,10 @@ class Problem:
         mesh: Mesh | None = None,
         **options: Any,
     ):
+        known = list(dict.fromkeys([*keywords_of(Problem.__init__), *OPTIONS]))
         for name in options:
             if name not in OPTIONS:
-                raise ModelError(wrong_keyword("Problem", name, [*keywords_of(Problem.__init__), *OPTIONS], ELSEWHERE))
+                raise ModelError(wrong_keyword("Problem", name, known, ELSEWHERE))
         if not isinstance(system, AcausalSystem):
             raise ModelError(f"Problem needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
         self.system = system
@@ -211,6 +212,7 @@ class Problem:
 
     # --- residuals ---------------------------------------------------------------------------------------------
 
+    @explained_keywords()
     def residuals(
         self,
         model: AcausalSystem | None = None,
@@ -384,6 +386,7 @@ class Problem:
         here = dataclasses.replace(here, watch=None, clock=None)
         return Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
 
+    @explained_keywords()
     def train(
         self,
         how: GradientSteps,
@@ -499,6 +502,7 @@ class Problem:
 
     # --- before a fit ------------------------------------------------------------------------------------------
 
+    @explained_keywords()
     def identifiability(
         self, *, freeze: Mapping[str, float] | Iterable[str] = (), start: Any = None
     ) -> Identifiability:
