@@ -1,6 +1,7 @@
 """`simulate`: a compiled system integrated by Diffrax."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -274,7 +275,7 @@ class _Call:
         """The largest numbers of steps and of events."""
         return self.asked.max_steps, MOST_EVENTS if self.max_events is None else self.max_events
 
-    @property
+    @functools.cached_property
     def run_by(self) -> Solver:
         """The solver of a run."""
         return SOLVERS[self.choice.solver]() if self.solver is None else self.solver
