@@ -25,6 +25,7 @@ from .intervals import intervals, noise_intervals, profile
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
 from .program import with_values
+from .properties import Properties, properties
 from .smoothing import followed
 from .table import Table
 from .training import Training
@@ -449,6 +450,26 @@ class Estimate:
         - `SimulationError` if no closed form can be simulated.
         """
         return discover(self, name, terms, width, most)
+
+    def properties(self, name: str) -> Properties:
+        """Whether a learned law is zero at zero, odd, a function of its input's size alone, rising or falling, by the
+        evidence. Each property is built into the network, and the problem is fitted again with it.
+
+        ```python
+        found = fit.properties("drag")
+        print(found)
+        better = found.fit
+        ```
+
+        **Arguments:**
+
+        - `name`: the name of a trained `equinox.nn.MLP` whose prior the evidence chooses.
+
+        **Raises:**
+
+        - `ModelError` for other names and networks.
+        """
+        return properties(self, name)
 
     @explained_keywords()
     def plot(

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
@@ -493,11 +494,13 @@ class Problem:
         other.system = system
         return other
 
-    def with_law(self, name: str, law: Any, stacked: Stacked) -> "Problem":
-        """A copy with another law in place of a network, without a prior."""
+    def with_law(self, name: str, law: Any, stacked: Stacked, penalty: str | None = None) -> "Problem":
+        """A copy with another law in place of a network, of this prior."""
+        dtype = self.system.parameters.values.dtype
+        law = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, law)
         other = copy.copy(self)
         other.system = eqx.tree_at(lambda s: s.neural, self.system, self.system.neural | {name: law})
-        other._stacked, other.penalties = stacked, self.penalties | {name: None}
+        other._stacked, other.penalties = stacked, self.penalties | {name: penalty}
         return other
 
     # --- before a fit ------------------------------------------------------------------------------------------
