@@ -99,9 +99,9 @@ def _kinds(fit: "Estimate", name: str, net: eqx.nn.MLP) -> dict[str, Callable[[A
         kinds["along its input, by its size"] = lambda g: AlongInput(g, small)
     if len(ends) == 1 and net.out_size in (1, "scalar"):
         grid = np.linspace(ends[0, 0], ends[0, 1], 50)
-        size = float(np.max(np.abs(fit.band(name, grid).mean))) or 1.0
-        for label, rises in (("rising", True), ("falling", False)):
-            kinds[label] = lambda g, rises=rises: Monotone(
-                1, 1, rises, key=jax.random.key(0), width=g.width_size, inputs=float(sizes[0]) or 1.0, outputs=size
-            )
+        mean = fit.band(name, grid).mean
+        size, rises = float(np.max(np.abs(mean))) or 1.0, bool(mean[-1] > mean[0])  # the other way, nothing would fit
+        kinds["rising" if rises else "falling"] = lambda g: Monotone(
+            1, 1, rises, key=jax.random.key(0), width=g.width_size, inputs=float(sizes[0]) or 1.0, outputs=size
+        )
     return kinds

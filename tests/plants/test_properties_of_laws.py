@@ -37,7 +37,7 @@ def test_an_odd_law_is_told_from_one_that_is_not(lift):
     """The lift is a hundred standard deviations of what the record tells of f(0)."""
     fit = fitted(lambda w: 0.3 * w * abs(w) + lift * np.exp(-((w / 0.5) ** 2)))
     found = fit.properties("c.drag")
-    assert set(found.fits) == {"none", "zero at zero", "odd", "rising", "falling"} and found.worth["falling"] < -100
+    assert set(found.fits) == {"none", "zero at zero", "odd", "rising"}
     if lift:
         assert found.best not in ("odd", "zero at zero") and found.worth["odd"] < -10
     else:
