@@ -343,7 +343,7 @@ class _Call:
                 say_of_members(number, texts, "runs that stopped", hint, self.throw, stacklevel=5)
                 checked = False
         x = raised(outcome.x, outcome.result, has_events, *self.bounds) if checked else outcome.x
-        return self._solution(outcome, outcome.stats, (outcome.ts, x, outcome.discrete), outcome.memory)
+        return self._solution(outcome, outcome.stats, (jnp.asarray(outcome.ts), x, outcome.discrete), outcome.memory)
 
     def outside(self) -> Solution:
         """The solution where values are known. Runs are repeated with an implicit solver, or with more room for events,
