@@ -24,7 +24,7 @@ class DiscreteDefinitions:
     - `stored`: those that are kept from event to event: a `when` assigns them, or their value before an event is read.
     - `followed`: those of `stored` that no `when` assigns, in the order of their definitions.
     - `equations`: what is left, for the continuous variables.
-    - `whens`: the `when`s of equations and algorithms.
+    - `whens`: the `when`s among equations; `sections`: the algorithms with a `when`.
     - `initial`: initial equations.
     - `algorithms`, `assigned`: the other algorithms, and the names that each assigns.
     """
@@ -34,6 +34,7 @@ class DiscreteDefinitions:
     followed: list[str]
     equations: list[tree.Statement]
     whens: list[tree.Branches]
+    sections: list[tuple[tree.Statement, ...]]
     initial: list[tree.Statement]
     algorithms: list[tuple[tree.Statement, ...]]
     assigned: list[list[str]]
@@ -41,18 +42,19 @@ class DiscreteDefinitions:
 
 def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> DiscreteDefinitions:
     """Splits the statements of a model."""
-    found = list(_whens_in(model.equations))
-    whens = _merged(found)
-    rest = [s for s in model.equations if s not in found] if found else list(model.equations)
+    whens = list(_whens_in(model.equations))
+    rest = [s for s in model.equations if s not in whens] if whens else list(model.equations)
     others = _with_choices(_by_entries(rest, model, is_discrete), is_discrete)
+    sections = [section for section in model.algorithms if any(_whens_in(section))]
+    by_when = set(with_entries(assigned_in((*whens, *(w for section in sections for w in _whens_in(section)))), model))
+    by_when |= {n for section in sections for n in with_entries(assigned_in(section), model) if is_discrete(n)}
     algorithms = []
     for section in model.algorithms:
-        inside = list(_whens_in(section))
-        rest = tuple(s for s in section if s not in inside)
-        whens += inside
+        rest = section
+        if section in sections:
+            rest = tuple(s for s in section if not set(with_entries(assigned_in((s,)), model)) <= by_when)
         if any(not isinstance(s, tree.Effect) for s in rest):
             algorithms.append(rest)
-    by_when = set(with_entries((name for s in whens for _, body in s.branches for name in assigned_in(body)), model))
     bindings = [
         tree.Equality(tree.Reference((d.name,)), d.value, d.line)
         for d in model.declarations
@@ -68,6 +70,8 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
         names = with_entries(assigned_in(section), model)
         assigned.append(names)
         for name in names:
+            if name in by_when:
+                continue
             if is_discrete(name):
                 of[name] = k
             else:
@@ -75,29 +79,13 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
     read_before = set(with_entries(_read_before((model.equations, model.algorithms, tuple(bindings))), model))
     followed = [name for name in of if name in read_before and name not in by_when]
     return DiscreteDefinitions(
-        of=of, stored=by_when | set(followed), followed=followed, equations=equations, whens=whens,
+        of=of, stored=by_when | set(followed), followed=followed, equations=equations, whens=whens, sections=sections,
         initial=list(model.initial_equations), algorithms=algorithms, assigned=assigned,
     )  # fmt: skip
 
 
 def _whens_in(statements: Iterable[tree.Statement]) -> Iterator[tree.Branches]:
     return (s for s in statements if isinstance(s, tree.Branches) and s.kind == "when")
-
-
-def _merged(whens: list[tree.Branches]) -> list[tree.Branches]:
-    """The whens of equations, those with one condition as one: what they assign at an instant holds for all of them."""
-    by_condition: dict[tree.Expression, int] = {}
-    out: list[tree.Branches] = []
-    for s in whens:
-        condition, body = s.branches[0]
-        if len(s.branches) == 1 and condition in by_condition:
-            first = out[by_condition[condition]]
-            out[by_condition[condition]] = first._replace(branches=((condition, first.branches[0][1] + body),))
-        else:
-            if len(s.branches) == 1:
-                by_condition[condition] = len(out)
-            out.append(s)
-    return out
 
 
 def _by_entries(

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 import sympy
 
 from ..base.errors import ModelError
-from ..write.events import assign
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
 from .continuous import equal, pairs, side_by_side
 from .definitions import assigned_in, with_entries
-from .scope import Scope
+from .scope import Scope, present
 from .tree import Branches, Call, Equality, Reference, Statement, each_part
 from .values import Value, as_number, is_condition
 
@@ -67,12 +66,12 @@ def write_initial_algorithm(scope: Scope, statements: tuple[Statement, ...]) -> 
 def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     """A start, where one side is a variable and the other is known beforehand; otherwise an equation at the start."""
     c = scope.component
-    left, right = _unwrapped(left), _unwrapped(right)
+    left, right = present(_unwrapped(left)), present(_unwrapped(right))
     for a, b in ((left, right), (right, left)):
         known = _in_parameters(b)
         if isinstance(a, DiscreteSymbol):
             if isinstance(b, sympy.Basic) and any(isinstance(s, VariableSymbol) for s in b.free_symbols):
-                c.when(scope.at_start(), assign(a, b), at_start=True)
+                scope.initially[a] = b
             else:
                 c.parameters[a.path] = c.parameters[a.path].with_value(
                     _plain(b) if known else float(_numerical(scope, b))

@@ -24,7 +24,7 @@ class Instant(eqx.Module):
     - `state`: the state after the events so far.
     - `left`: the events still to happen, shape (clocks + guards,).
     - `caused`: the guards that another event of this instant made fall, shape (guards,).
-    - `delay`: δ of the last event (second).
+    - `delay`: δ of the last event (second); `time`: when it happened.
     - `round`: the events that happen as one: all read what was before the first of them; what they cause comes after.
     - `before`, `approach`, `previous`: the continuous state before this round, its slope, and the discrete values.
     - `slope`: dx/dt after the last event.
@@ -38,6 +38,7 @@ class Instant(eqx.Module):
     left: Array
     caused: Array
     delay: Time
+    time: Time
     round: Array
     before: Array
     approach: Array

@@ -1,0 +1,191 @@
+"""The `when`s and the other discrete equations of a flat model, read into its `DiscreteMap`."""
+
+import collections
+from collections.abc import Iterator
+from typing import TypeAlias
+
+import sympy
+
+from ..base.errors import ModelError
+from ..write.symbols import DiscreteSymbol
+from . import tree
+from .definitions import assigned_in, with_entries
+from .discrete_map import DiscreteMap
+from .scope import Scope, previous
+from .values import Value, as_condition, as_number, both, chosen, negated
+
+Target: TypeAlias = sympy.Symbol | str  # what an action writes; a text for `terminate`
+
+
+def read_followed(found: DiscreteMap, name: str) -> None:
+    """A discrete variable that has an equation outside of whens."""
+    scope = found.scope
+    value = scope.defined(name, scope.definitions.of[name])
+    found.give(name, scope.kept.with_jumps_as_variables(value), always=True)
+
+
+def read_when(found: DiscreteMap, s: tree.Branches) -> None:
+    """A `when` among equations: what its body assigns is what it was before where no branch acts."""
+    scope = found.scope
+    acting = found.branches([list(_conditions(scope, c, scope.value)) for c, _ in s.branches])
+    cases: dict[str, list[tuple[Value, Value]]] = {}
+    for acts, (_, body) in zip(acting, s.branches, strict=True):
+        for target, value in _each_action(scope, body):
+            if isinstance(target, str):
+                found.end(acts, target)
+            elif isinstance(target, DiscreteSymbol):
+                cases.setdefault(target.path, []).append((acts, value))
+            else:
+                found.reinit(acts, target, value)
+    for name, given in cases.items():
+        found.give(name, _first(given, previous(DiscreteSymbol(name))))
+
+
+def read_section(found: DiscreteMap, section: tuple[tree.Statement, ...]) -> None:
+    """An algorithm with whens: its statements count one after another, so that the last assignment does. A variable has
+    its value before the event until it is assigned, and what is assigned once and then read is read as its new value.
+    """
+    scope = found.scope
+    count = collections.Counter(n for s in section for n in with_entries(_all_assigned(s), scope.flat.model))
+    kept = [n for n in count if n in scope.definitions.stored]
+    local: dict[str, Value] = {n: previous(scope.stored(n)) for n in kept}
+    given: dict[str, Value] = {}
+
+    def names(name: str) -> Value:
+        return local[name] if name in local else scope.value(name)
+
+    def settle(before: dict[str, Value], s: tree.Statement) -> None:
+        for n in with_entries(_all_assigned(s), scope.flat.model):
+            if n in before and count[n] == 1:
+                given[n], local[n] = local[n], scope.stored(n)
+
+    for s in section:
+        if not (isinstance(s, tree.Branches) and s.kind == "when"):
+            if not isinstance(s, tree.Effect):
+                scope.interpreter.execute((s,), local, names)
+                settle(dict.fromkeys(kept), s)
+            continue
+        acting = found.branches([list(_conditions(scope, c, names)) for c, _ in s.branches])
+        before = dict(local)
+        results = []
+        for acts, (_, body) in zip(acting, s.branches, strict=True):
+            local.clear()
+            local.update(before)
+            once: dict[str, Value] = {}
+            for each in body:
+                if isinstance(each, tree.Effect):
+                    for target, value in _each_action(scope, (each,)):
+                        if isinstance(target, str):
+                            found.end(acts, target)
+                        else:
+                            found.reinit(acts, target, value)
+                    continue
+                scope.interpreter.execute((each,), local, names)
+                for n in with_entries(_all_assigned(each), scope.flat.model):
+                    if n in kept and count[n] == 1:
+                        once[n], local[n] = local[n], scope.stored(n)
+            results.append((acts, {n: once.get(n, local.get(n)) for n in kept}))
+        local.clear()
+        local.update(before)
+        for n in kept:
+            value = before[n]
+            for acts, after in reversed(results):
+                value = chosen(acts, after[n], value)
+            local[n] = value
+        settle(dict.fromkeys(kept), s)
+    for n in kept:
+        found.give(n, given.get(n, local[n]), always=True)
+
+
+def _all_assigned(s: tree.Statement) -> list[str]:
+    return list(assigned_in((s,)))
+
+
+def _conditions(scope: Scope, condition: tree.Expression, names) -> Iterator[tuple[Value, bool]]:
+    """The conditions of which each makes a branch act, those of an array by themselves, each with whether it counts at
+    the initial time."""
+    if isinstance(condition, tree.Array):
+        for entry in condition.entries:
+            yield from _conditions(scope, entry, names)
+        return
+    at_start = any(isinstance(e, tree.Call) and e.function == "initial" for e in tree.each_part(condition))
+    value = scope.interpreter.evaluate(condition, names)
+    for each in value if isinstance(value, list) else [value]:
+        yield as_condition(each), at_start
+
+
+def _first(cases: list[tuple[Value, Value]], otherwise: Value) -> Value:
+    """The value of the first case whose condition holds."""
+    value = otherwise
+    for acts, result in reversed(cases):
+        value = chosen(acts, as_number(result), value)
+    return value
+
+
+def _each_action(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tuple[Target, Value]]:
+    """Pairs (variable, new value); a text for `terminate`."""
+    if any(isinstance(s, tree.Assignment | tree.Loop) for s in body):
+        yield from _of_loops(scope, tuple(s for s in body if not isinstance(s, tree.Effect)))
+        body = tuple(s for s in body if isinstance(s, tree.Effect))
+    for s in body:
+        if isinstance(s, tree.Effect):
+            name, arguments = s.call.function, s.call.arguments
+            if name == "reinit":
+                yield scope.evaluate(arguments[0]), sympy.sympify(scope.evaluate(arguments[1]))
+            elif name == "terminate":
+                yield str(scope.evaluate(arguments[0])), None
+        elif isinstance(s, tree.Equality | tree.Assignment):
+            several = isinstance(s.left, tree.Several)
+            found = scope.interpreter.results(s.right) if several else scope.evaluate(s.right)
+            yield from _assigned(scope, s.left, found)
+        elif isinstance(s, tree.Branches) and s.kind == "if":
+            yield from _chosen_actions(scope, s)
+        else:
+            raise ModelError(f"a {type(s).__name__.lower()} in a when")
+
+
+def _of_loops(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tuple[Target, Value]]:
+    """What loops of equations assign."""
+    local: dict[str, Value] = {}
+    scope.interpreter.execute(body, local, lambda n: local[n] if n in local else scope.value(n))
+    for n in with_entries(assigned_in(body), scope.flat.model):
+        if n in scope.definitions.stored and n in local:
+            yield DiscreteSymbol(n), local[n]
+
+
+def _assigned(scope: Scope, target: tree.Expression, value: Value) -> Iterator[tuple[Target, Value]]:
+    if isinstance(target, tree.Several):
+        for each, v in zip(target.entries, value, strict=False):
+            if each is not None:
+                yield from _assigned(scope, each, v)
+        return
+    if not isinstance(target, tree.Reference):
+        raise ModelError("in a when, a variable stands on the left")
+    name = scope.interpreter.name_of(target)
+    if isinstance(value, list):
+        for each, entry in scope.interpreter.entries_of(name, value):
+            yield DiscreteSymbol(each), sympy.sympify(as_number(entry))
+        return
+    if name not in scope.definitions.stored:
+        raise ModelError(f"'{name}' cannot be assigned in a when")
+    if not isinstance(value, str):
+        yield DiscreteSymbol(name), sympy.sympify(as_number(value))
+
+
+def _chosen_actions(scope: Scope, s: tree.Branches) -> Iterator[tuple[Target, Value]]:
+    """An `if` within a when: each target has the value of the branch that holds, or the one before."""
+    found: dict[sympy.Symbol, list[tuple[Value, Value]]] = {}
+    otherwise: Value = True
+    for condition, body in s.branches:
+        holds = as_condition(scope.evaluate(condition))
+        here = both(otherwise, holds)
+        for target, value in _each_action(scope, body) if here is not False else ():
+            if isinstance(target, str):
+                raise ModelError("terminate under an if in a when")
+            found.setdefault(target, []).append((here, value))
+        otherwise = both(otherwise, negated(holds))
+        if otherwise is False:
+            break
+    for target, cases in found.items():
+        discrete = isinstance(target, DiscreteSymbol)
+        yield target, _first(cases, previous(target) if discrete else target)
