@@ -117,8 +117,8 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
         conditions = [c for c, _ in s.branches]
         bodies = [_with_choices(body, is_discrete) for _, body in s.branches]
         values = [
-            {e.left.path: e.right for e in body
-             if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(e.left.path)}
+            {_name(e.left): e.right for e in body
+             if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(_name(e.left))}
             for body in bodies
         ]  # fmt: skip
         names = [n for n in values[0] if all(n in v for v in values)] if conditions[-1] == tree.Truth(True) else []
@@ -126,7 +126,7 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
             branches = tuple((c, v[n]) for c, v in zip(conditions[:-1], values, strict=False))
             out.append(tree.Equality(tree.Reference((n,)), tree.Choice(branches, values[-1][n]), s.line))
         rest = tuple(
-            (c, tuple(e for e in body if not (isinstance(e, tree.Equality) and getattr(e.left, "path", None) in names)))
+            (c, tuple(e for e in body if not (isinstance(e, tree.Equality) and _given(e) in names)))
             for c, body in zip(conditions, bodies, strict=True)
         )
         if any(body for _, body in rest):
@@ -143,7 +143,7 @@ def _definable(
     out = []
     for side, other in ((s.left, s.right), (s.right, s.left)):
         if isinstance(side, tree.Reference):
-            name = side.path
+            name = _name(side)
             if is_discrete(name) and name not in by_when:
                 out.append((name, other))
     return out
@@ -168,7 +168,7 @@ def _matched(
 
     def may_be_left(k: int) -> bool:
         other = candidates[k][1][0][1]
-        return len(candidates[k][1]) == 1 and isinstance(other, tree.Reference) and not is_discrete(other.path)
+        return len(candidates[k][1]) == 1 and isinstance(other, tree.Reference) and not is_discrete(_name(other))
 
     for k in sorted(range(len(candidates)), key=may_be_left):
         if not place(k, set()):
@@ -191,6 +191,11 @@ def assigned_in(statements: tuple[tree.Statement, ...]) -> Iterator[str]:
                 yield from assigned_in(body)
         elif isinstance(s, tree.Loop):
             yield from assigned_in(s.body)
+
+
+def _given(e: tree.Equality) -> str:
+    """The name of the variable that stands alone on the left; "" if there is none."""
+    return _name(e.left) if isinstance(e.left, tree.Reference) else ""
 
 
 def _name(e: tree.Reference) -> str:

@@ -5,6 +5,7 @@ parameters are constants. Boolean, Integer and enumeration variables are of two 
 event are discrete variables; the others are expressions, put in wherever they are read.
 """
 
+import dataclasses
 import functools
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -25,8 +26,9 @@ from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
-from .tree import Assignment, Declaration, Equality, Expression, Reference, Truth, entry_name
+from .tree import Assignment, Class, Declaration, Equality, Expression, Reference, Truth, entry_name
 from .values import Record, Value, as_number, both, is_condition, negated, plain
+from .written_out import entries_of, unrolled
 
 REAL = "Real"
 _TEXTS = ("String", "StateSelect", "AssertionLevel")
@@ -46,7 +48,8 @@ class Scope:
     - `kept`: relations whose truth is kept between events.
     - `names`: names of long expressions of functions.
     - `initial`: the discrete variable that says how far the initial time is; None if nothing asks for it.
-    - `initially`: what initial equations say of discrete variables that is not known beforehand.
+    - `said`: the discrete variables of which initial equations say what they are; `initially`: what that is, where it
+      is not known beforehand.
     - `ticks`: the discrete variables that are 1 in the iteration in which a clock ticks, by the clock.
     - `as_numbers`: True while parameters are read as their values, which are final then.
     """
@@ -74,14 +77,42 @@ class Scope:
             self.entries, self._named,
         )  # fmt: skip
         self.kept = KeptRelations(component, self.interpreter.quieted)
-        self.definitions = find_definitions(flat.model, self.is_discrete)
-        self.names: dict[sympy.Expr, sympy.Symbol] = {}
-        self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.as_numbers = False
         self.final: dict[str, Value] = {}
+        self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
+        self.declared = {d.name: d for d in flat.model.declarations}
+        for known, new in zip((self.entries, self.fields), _gather(self.declared), strict=True):
+            known.update(new)
+        self.definitions = find_definitions(self.flat.model, self.is_discrete)
+        self.names: dict[sympy.Expr, sympy.Symbol] = {}
+        self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.initial: DiscreteSymbol | None = None
+        self.said: set[DiscreteSymbol] = set()
         self.initially: dict[DiscreteSymbol, Value] = {}
         self.ticks: dict[Sampled, DiscreteSymbol] = {}
+
+    def _written_out(self, model: Class) -> Class:
+        """The model with its arrays of variables and its loops of equations written out; sizes and ranges are known
+        now."""
+
+        def values_of(over: Expression | None) -> list:
+            if over is None:
+                raise ModelError("it must be written out, as 1:n")
+            values = self.interpreter.constant(over)
+            return values if isinstance(values, list) else [values]
+
+        def is_array(e: Expression) -> bool:
+            return isinstance(self.evaluate(e), list)
+
+        declared: list[Declaration] = []
+        for d in model.declarations:
+            if d.dimensions and not d.prefixes & _CONSTANT and self.kind(d.type) not in _TEXTS:
+                sizes = [self.interpreter.constant(n) for n in d.dimensions]
+                declared += located(model.name, d.line, lambda d, n: list(entries_of(d, n, is_array)), d, sizes)
+            else:
+                declared.append(d)
+        equations, initial = (unrolled(s, values_of) for s in (model.equations, model.initial_equations))
+        return model._replace(declarations=tuple(declared), equations=equations, initial_equations=initial)
 
     def evaluate(self, e: Expression) -> Value:
         return self.interpreter.evaluate(e)

@@ -69,7 +69,8 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     left, right = present(_unwrapped(left)), present(_unwrapped(right))
     for a, b in ((left, right), (right, left)):
         known = _in_parameters(b)
-        if isinstance(a, DiscreteSymbol):
+        if isinstance(a, DiscreteSymbol) and a not in scope.said:
+            scope.said.add(a)
             if isinstance(b, sympy.Basic) and any(isinstance(s, VariableSymbol) for s in b.free_symbols):
                 scope.initially[a] = b
             else:

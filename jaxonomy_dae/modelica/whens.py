@@ -31,74 +31,92 @@ def read_when(found: DiscreteMap, s: tree.Branches) -> None:
     cases: dict[str, list[tuple[Value, Value]]] = {}
     for acts, (_, body) in zip(acting, s.branches, strict=True):
         for target, value in _each_action(scope, body):
-            if isinstance(target, str):
-                found.end(acts, target)
-            elif isinstance(target, DiscreteSymbol):
+            if isinstance(target, DiscreteSymbol):
                 cases.setdefault(target.path, []).append((acts, value))
             else:
-                found.reinit(acts, target, value)
+                _act(found, acts, target, value)
     for name, given in cases.items():
         found.give(name, _first(given, previous(DiscreteSymbol(name))))
 
 
 def read_section(found: DiscreteMap, section: tuple[tree.Statement, ...]) -> None:
-    """An algorithm with whens: its statements count one after another, so that the last assignment does. A variable has
-    its value before the event until it is assigned, and what is assigned once and then read is read as its new value.
-    """
-    scope = found.scope
-    count = collections.Counter(n for s in section for n in with_entries(_all_assigned(s), scope.flat.model))
-    kept = [n for n in count if n in scope.definitions.stored]
-    local: dict[str, Value] = {n: previous(scope.stored(n)) for n in kept}
-    given: dict[str, Value] = {}
-
-    def names(name: str) -> Value:
-        return local[name] if name in local else scope.value(name)
-
-    def settle(before: dict[str, Value], s: tree.Statement) -> None:
-        for n in with_entries(_all_assigned(s), scope.flat.model):
-            if n in before and count[n] == 1:
-                given[n], local[n] = local[n], scope.stored(n)
-
+    """An algorithm with whens: its statements count one after another, so that the last assignment does."""
+    algorithm = _Algorithm(found, section)
     for s in section:
-        if not (isinstance(s, tree.Branches) and s.kind == "when"):
-            if not isinstance(s, tree.Effect):
-                scope.interpreter.execute((s,), local, names)
-                settle(dict.fromkeys(kept), s)
-            continue
-        acting = found.branches([list(_conditions(scope, c, names)) for c, _ in s.branches])
-        before = dict(local)
-        results = []
+        if isinstance(s, tree.Branches) and s.kind == "when":
+            algorithm.carry_out_when(s)
+        else:
+            algorithm.carry_out(s)
+    for name in algorithm.kept:
+        found.give(name, algorithm.once.get(name, algorithm.local[name]), always=True)
+
+
+class _Algorithm:
+    """An algorithm with whens, carried out statement by statement.
+
+    - `local`: the values so far. A variable that is kept has its value before the event until it is assigned; what is
+      assigned once stands for itself from then on, so that long expressions stand once.
+    - `once`: the values of the latter.
+    """
+
+    def __init__(self, found: DiscreteMap, section: tuple[tree.Statement, ...]):
+        self.found, self.scope = found, found.scope
+        self.count = collections.Counter(n for s in _statements(section) for n in self._assigned(s))
+        self.kept = [n for n in self.count if n in self.scope.definitions.stored]
+        self.local: dict[str, Value] = {n: previous(self.scope.stored(n)) for n in self.kept}
+        self.once: dict[str, Value] = {}
+
+    def names(self, name: str) -> Value:
+        return self.local[name] if name in self.local else self.scope.value(name)
+
+    def carry_out(self, s: tree.Statement) -> None:
+        if isinstance(s, tree.Effect):
+            return
+        self.scope.interpreter.execute((s,), self.local, self.names)
+        for n in self._assigned(s):
+            self._settle(n, self.local.get(n))
+
+    def carry_out_when(self, s: tree.Branches) -> None:
+        acting = self.found.branches([list(_conditions(self.scope, c, self.names)) for c, _ in s.branches])
+        before, results = dict(self.local), []
         for acts, (_, body) in zip(acting, s.branches, strict=True):
-            local.clear()
-            local.update(before)
-            once: dict[str, Value] = {}
+            self.local = dict(before)
             for each in body:
+                self.carry_out(each)
                 if isinstance(each, tree.Effect):
-                    for target, value in _each_action(scope, (each,)):
-                        if isinstance(target, str):
-                            found.end(acts, target)
-                        else:
-                            found.reinit(acts, target, value)
-                    continue
-                scope.interpreter.execute((each,), local, names)
-                for n in with_entries(_all_assigned(each), scope.flat.model):
-                    if n in kept and count[n] == 1:
-                        once[n], local[n] = local[n], scope.stored(n)
-            results.append((acts, {n: once.get(n, local.get(n)) for n in kept}))
-        local.clear()
-        local.update(before)
-        for n in kept:
-            value = before[n]
-            for acts, after in reversed(results):
-                value = chosen(acts, after[n], value)
-            local[n] = value
-        settle(dict.fromkeys(kept), s)
-    for n in kept:
-        found.give(n, given.get(n, local[n]), always=True)
+                    for target, value in _each_action(self.scope, (each,)):
+                        _act(self.found, acts, target, value)
+            once = {n: self.once[n] for each in body for n in self._assigned(each) if n in self.once}
+            results.append((acts, self.local | once))
+        self.local = dict(before)
+        for n in self.kept:
+            if any(n in self._assigned(each) for _, body in s.branches for each in body):
+                self.local[n] = _first([(acts, after[n]) for acts, after in results], before[n])
+                self._settle(n, self.local[n])
+
+    def _settle(self, name: str, value: Value) -> None:
+        if name in self.kept and self.count[name] == 1:
+            self.once[name], self.local[name] = value, self.scope.stored(name)
+
+    def _assigned(self, s: tree.Statement) -> list[str]:
+        return with_entries(assigned_in((s,)), self.scope.flat.model)
 
 
-def _all_assigned(s: tree.Statement) -> list[str]:
-    return list(assigned_in((s,)))
+def _statements(section: tuple[tree.Statement, ...]) -> Iterator[tree.Statement]:
+    """The statements of an algorithm, with those of its whens one by one."""
+    for s in section:
+        if isinstance(s, tree.Branches) and s.kind == "when":
+            yield from (each for _, body in s.branches for each in body)
+        else:
+            yield s
+
+
+def _act(found: DiscreteMap, acts: Value, target: Target, value: Value) -> None:
+    """What a branch does beside assigning."""
+    if isinstance(target, str):
+        found.end(acts, target)
+    else:
+        found.reinit(acts, target, value)
 
 
 def _conditions(scope: Scope, condition: tree.Expression, names) -> Iterator[tuple[Value, bool]]:
@@ -118,7 +136,7 @@ def _first(cases: list[tuple[Value, Value]], otherwise: Value) -> Value:
     """The value of the first case whose condition holds."""
     value = otherwise
     for acts, result in reversed(cases):
-        value = chosen(acts, as_number(result), value)
+        value = chosen(acts, result, value)
     return value
 
 
