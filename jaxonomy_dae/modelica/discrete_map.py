@@ -22,6 +22,7 @@ import sympy
 
 from ..base.aliases import Condition, Expression
 from ..base.errors import ModelError
+from ..graph.expressions.to_sympy import shortened
 from ..write.events import Assign, EventFlag, Reinit, Terminate, pre
 from ..write.symbols import DiscreteSymbol, VariableSymbol
 from .scope import AT_FIRST, REAL, STARTED, STARTING, Scope, previous
@@ -78,7 +79,7 @@ class DiscreteMap:
             acts = self._truth("acts", both(rises, negated(before)))
             before = either(before, acts)
             if not isinstance(acts, bool):
-                text = " or ".join(str(truth) for truth, _ in entries if truth is not False)
+                text = " or ".join(self._shown(truth) for truth, _ in entries if truth is not False)
                 self._branches.append(Branch(acts, text))
             out.append(acts)
         return out
@@ -108,6 +109,20 @@ class DiscreteMap:
         rises = both(now, plain(sympy.Eq(was, 0)))
         return rises if at_start else both(rises, started)
 
+    def _shown(self, truth: Value) -> str:
+        """A condition as the text has it."""
+        if not isinstance(truth, sympy.Basic):
+            return str(truth)
+        names: dict[sympy.Basic, sympy.Basic] = {
+            sympy.Eq(tick, 1): sympy.Symbol(f"sampled({clock.period})") for clock, tick in self.scope.ticks.items()
+        }
+        for s in truth.free_symbols:
+            if isinstance(s, DiscreteSymbol):
+                known = sympy.Symbol(str(s)[1:] if str(s).startswith(":pre(") else str(s))
+                names |= {sympy.Eq(s, 1): known, s: known} if s not in self.scope.ticks.values() else {}
+        names |= {self.scope.phase(STARTED): sympy.true, sympy.Ne(self.scope.initial, STARTED): sympy.Symbol("initial()")}
+        return shortened(truth.xreplace(names))
+
     def _truth(self, kind: str, condition: Value) -> Value:
         """A condition as a hidden variable that is 1 or 0, so that what is long stands once."""
         if isinstance(condition, bool):
@@ -116,11 +131,11 @@ class DiscreteMap:
         self._hidden[symbol] = as_number(condition)
         return sympy.Eq(symbol, 1)
 
-    def keep_relations(self) -> None:
-        """Makes the relations that are read so far ones whose truth is kept, for the equations that come after."""
-        self.values = {n: self.scope.kept.in_discrete(value) for n, value in self.values.items()}
+    def share_relations(self) -> None:
+        """Lets bodies see the relations that conditions and equations read as these do, when all of them are known."""
+        self.values = {n: self.scope.kept.in_bodies(value) for n, value in self.values.items()}
         for cases in self._reinits.values():
-            cases[:] = [(acts, self.scope.kept.in_discrete(value)) for acts, value in cases]
+            cases[:] = [(acts, self.scope.kept.in_bodies(value)) for acts, value in cases]
 
     # --- what is written ---------------------------------------------------------------------------------------------
 

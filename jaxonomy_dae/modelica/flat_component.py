@@ -60,7 +60,7 @@ class FlatComponent(Component):
             located(flat.name, s.line, read_when, discrete, s)
         for section in found.sections:
             located(flat.name, section[0].line, read_section, discrete, section)
-        discrete.keep_relations()
+        discrete.share_relations()
         for write, statements in (
             (write_equation, equations),
             (write_initial_equation, in_order(scope, found.initial)),

@@ -9,9 +9,11 @@ from collections.abc import Collection, Iterator
 import sympy
 
 from ..base.aliases import Condition, Expression
+from ..graph.expressions.from_sympy import symbols_of
 from ..graph.expressions.smooth import Smooth
 from ..write.automatic_events import ROUNDING, varies
 from ..write.component import Component
+from ..write.symbols import DiscreteSymbol, VariableSymbol
 from .values import Value, plain
 
 _ORDER = (sympy.StrictGreaterThan, sympy.GreaterThan, sympy.StrictLessThan, sympy.LessThan)
@@ -31,6 +33,14 @@ class KeptRelations:
         if not isinstance(value, sympy.Basic):
             return value
         found = {r: self._form(r) for r in _outermost(value, _ORDER) if varies(r) and r not in self.quiet}
+        return plain(value.xreplace(found)) if found else value
+
+    def in_bodies(self, value: Value) -> Value:
+        """A value in the body of a `when` with those of its relations replaced that others read, or that turn at times
+        known beforehand: the rest is looked at where the body holds only."""
+        if not isinstance(value, sympy.Basic):
+            return value
+        found = {r: self._form(r) for r in _outermost(value, _ORDER) if self._known(r) or _is_of_time(r)}
         return plain(value.xreplace(found)) if found else value
 
     def in_equations(self, expression: Expression) -> Expression:
@@ -59,6 +69,11 @@ class KeptRelations:
         if relation not in self.forms:
             self.forms[relation] = self.component._followed(relation)[0]
         return self.forms[relation]
+
+
+def _is_of_time(relation: Condition) -> bool:
+    symbols = symbols_of(relation)
+    return varies(relation) and not any(isinstance(s, VariableSymbol | DiscreteSymbol) for s in symbols)
 
 
 def _outermost(value: Expression, kinds: tuple[type, ...]) -> Iterator[Expression]:

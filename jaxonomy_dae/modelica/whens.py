@@ -21,7 +21,7 @@ def read_followed(found: DiscreteMap, name: str) -> None:
     """A discrete variable that has an equation outside of whens."""
     scope = found.scope
     value = scope.defined(name, scope.definitions.of[name])
-    found.give(name, scope.kept.with_jumps_as_variables(value), always=True)
+    found.give(name, scope.kept.in_discrete(scope.kept.with_jumps_as_variables(value)), always=True)
 
 
 def read_when(found: DiscreteMap, s: tree.Branches) -> None:
@@ -47,6 +47,7 @@ def read_section(found: DiscreteMap, section: tuple[tree.Statement, ...]) -> Non
             algorithm.carry_out_when(s)
         else:
             algorithm.carry_out(s)
+            algorithm.keep_relations()
     for name in algorithm.kept:
         found.give(name, algorithm.once.get(name, algorithm.local[name]), always=True)
 
@@ -75,6 +76,11 @@ class _Algorithm:
         self.scope.interpreter.execute((s,), self.local, self.names)
         for n in self._assigned(s):
             self._settle(n, self.local.get(n))
+
+    def keep_relations(self) -> None:
+        """Keeps the truth of relations that were read outside of whens."""
+        for values in (self.local, self.once):
+            values.update({n: self.scope.kept.in_discrete(values[n]) for n in self.kept if n in values})
 
     def carry_out_when(self, s: tree.Branches) -> None:
         acting = self.found.branches([list(_conditions(self.scope, c, self.names)) for c, _ in s.branches])
