@@ -34,7 +34,8 @@ SAME = sympy.Float(1e-10)
 
 
 class Branch(NamedTuple):
-    """A branch of a `when`: `acts` is true in the iteration in which its body holds."""
+    """A branch of a `when`: `acts` is true in the iteration in which its body holds; `text` is its condition, "" if it
+    is that of clocks alone."""
 
     acts: Condition
     text: str
@@ -79,8 +80,8 @@ class DiscreteMap:
             acts = self._truth("acts", both(rises, negated(before)))
             before = either(before, acts)
             if not isinstance(acts, bool):
-                text = " or ".join(self._shown(truth) for truth, _ in entries if truth is not False)
-                self._branches.append(Branch(acts, text))
+                shown = [_shown(self.scope, t) for t, _ in entries if t is not False and not self._is_tick(t)]
+                self._branches.append(Branch(acts, " or ".join(shown)))
             out.append(acts)
         return out
 
@@ -100,8 +101,7 @@ class DiscreteMap:
         if isinstance(kept, bool):
             return False
         started = self.scope.phase(STARTED)
-        ticks = {tick: sympy.Integer(0) for tick in self.scope.ticks.values()}
-        if plain(kept.xreplace(ticks)) is False:  # true for one iteration: nothing is to be remembered
+        if self._is_tick(kept):  # true for one iteration: nothing is to be remembered
             return both(kept, started)
         now = self._truth("true", kept)
         was = self.scope.hidden(f":was[{len(self._conditions)}]", 0)
@@ -109,19 +109,10 @@ class DiscreteMap:
         rises = both(now, plain(sympy.Eq(was, 0)))
         return rises if at_start else both(rises, started)
 
-    def _shown(self, truth: Value) -> str:
-        """A condition as the text has it."""
-        if not isinstance(truth, sympy.Basic):
-            return str(truth)
-        names: dict[sympy.Basic, sympy.Basic] = {
-            sympy.Eq(tick, 1): sympy.Symbol(f"sampled({clock.period})") for clock, tick in self.scope.ticks.items()
-        }
-        for s in truth.free_symbols:
-            if isinstance(s, DiscreteSymbol):
-                known = sympy.Symbol(str(s)[1:] if str(s).startswith(":pre(") else str(s))
-                names |= {sympy.Eq(s, 1): known, s: known} if s not in self.scope.ticks.values() else {}
-        names |= {self.scope.phase(STARTED): sympy.true, sympy.Ne(self.scope.initial, STARTED): sympy.Symbol("initial()")}
-        return shortened(truth.xreplace(names))
+    def _is_tick(self, truth: Value) -> bool:
+        """True for a condition that holds at the ticks of clocks only."""
+        ticks = {tick: sympy.Integer(0) for tick in self.scope.ticks.values()}
+        return isinstance(truth, sympy.Basic) and plain(truth.xreplace(ticks)) is False
 
     def _truth(self, kind: str, condition: Value) -> Value:
         """A condition as a hidden variable that is 1 or 0, so that what is long stands once."""
@@ -174,7 +165,7 @@ class DiscreteMap:
             assigned = tuple(Assign(m, n) for m, n in new.items())
             c._event(_is(pending), assigned, None, solves, f"equations of {names}")
         settled = both(started, plain(sympy.Eq(pending, 0))) if unsettled else started
-        acts = functools.reduce(either, (b.acts for b in self._branches), False)
+        acts = functools.reduce(either, (b.acts for b in self._branches if b.text), False)
         moves: list[Value] = [plain(sympy.Ne(new[m], previous(m))) for m in new if m.path in self.always]
         moves += [plain(sympy.Ne(now, was)) for now, was in self._conditions]
         moves += [plain(sympy.Eq(tick, 1)) for tick in scope.ticks.values()]
@@ -192,13 +183,13 @@ class DiscreteMap:
             Reinit(x, VariableSymbol(c._hidden(f":when:reinit[{x.path}]", _first(cases, x).xreplace(replaced))))
             for x, cases in self._reinits.items()
         ]
-        shown = " or ".join(dict.fromkeys(b.text for b in self._branches))
+        shown = " or ".join(dict.fromkeys(b.text for b in self._branches if b.text)) or "a tick"
         whens = self._number("happens", both(settled, acts))
         if whens is not None:
             c._event(_is(whens), (*actions, *starts), None, solves | EventFlag.LAST | EventFlag.LISTED, shown)
         quiet = self._number("goes on", both(both(settled, negated(acts)), goes_on))
         if quiet is not None:
-            c._event(_is(quiet), tuple(actions), None, solves | EventFlag.LAST, f"next iteration of {names}")
+            c._event(_is(quiet), (*actions, *starts), None, solves | EventFlag.LAST, f"next iteration of {names}")
         for done, text, _ in ends:
             c._event(sympy.Eq(done, 1), (Terminate(text),), None, EventFlag.LISTED | EventFlag.AT_START, shown)
 
@@ -213,6 +204,20 @@ class DiscreteMap:
         if isinstance(condition, bool):
             return None
         return VariableSymbol(self.scope.component._hidden(f":when:{kind}", as_number(condition)))
+
+
+def _shown(scope: Scope, truth: Value) -> str:
+    """A condition as the text has it."""
+    if not isinstance(truth, sympy.Basic):
+        return str(truth)
+    names: dict[sympy.Basic, sympy.Basic] = {scope.phase(STARTED): sympy.true}
+    for clock, tick in scope.ticks.items():
+        period = sympy.sympify(clock.period)
+        names[sympy.Eq(tick, 1)] = sympy.Symbol(f"sampled({f'{float(period):g}' if period.is_number else period})")
+    for s in truth.free_symbols:
+        if isinstance(s, DiscreteSymbol) and s != scope.initial and s not in scope.ticks.values():
+            names |= dict.fromkeys((sympy.Eq(s, 1), s), sympy.Symbol(str(s).removeprefix(":")))
+    return shortened(truth.xreplace(names))
 
 
 def _is(truth: VariableSymbol) -> Condition:

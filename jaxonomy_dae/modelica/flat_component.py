@@ -11,7 +11,7 @@ from .flat_model import FlatModel
 from .laws import equation_of, write_law
 from .scope import Scope, located
 from .semi_linear import with_chains_solved
-from .starts import in_order, write_initial_algorithm, write_initial_equation
+from .starts import hold_waiting, in_order, write_initial_algorithm, write_initial_equation
 from .values import as_number
 from .whens import read_followed, read_section, read_when
 
@@ -67,6 +67,7 @@ class FlatComponent(Component):
         ):
             for s in statements:
                 located(flat.name, s.line, write, scope, s)
+        hold_waiting(scope)
         for statements in filter(None, flat.model.initial_algorithms):
             located(flat.name, statements[0].line, write_initial_algorithm, scope, statements)
         for variable, law in flat.laws.items():

@@ -4,7 +4,7 @@ Between events the truth is kept, as in Modelica. All modes of an instant see th
 rests at the level, and continuous equations see the one that the modes see.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 
 import sympy
 
@@ -76,14 +76,17 @@ def _is_of_time(relation: Condition) -> bool:
     return varies(relation) and not any(isinstance(s, VariableSymbol | DiscreteSymbol) for s in symbols)
 
 
-def _outermost(value: Expression, kinds: tuple[type, ...]) -> Iterator[Expression]:
-    """The parts of these kinds that stand in no other one, nor in what is smooth; each once."""
+def _outermost(value: Expression, kinds: tuple[type, ...]) -> list[Expression]:
+    """The parts of these kinds that stand in no other one, nor in what is smooth; each once, in an order that is the
+    same in every process."""
     walk = sympy.preorder_traversal(value)
     seen: set[Expression] = set()
+    found: list[Expression] = []
     for e in walk:
         if isinstance(e, Smooth) or e in seen:
             walk.skip()
         elif isinstance(e, kinds):
             walk.skip()
             seen.add(e)
-            yield e
+            found.append(e)
+    return sorted(found, key=str) if len(found) > 1 else found

@@ -49,7 +49,8 @@ class Scope:
     - `names`: names of long expressions of functions.
     - `initial`: the discrete variable that says how far the initial time is; None if nothing asks for it.
     - `said`: the discrete variables of which initial equations say what they are; `initially`: what that is, where it
-      is not known beforehand.
+      is not known beforehand. `waiting`: initial equations of discrete variables that wait for others, which they do
+      while `postpones` is true.
     - `ticks`: the discrete variables that are 1 in the iteration in which a clock ticks, by the clock.
     - `as_numbers`: True while parameters are read as their values, which are final then.
     """
@@ -88,6 +89,8 @@ class Scope:
         self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.initial: DiscreteSymbol | None = None
         self.said: set[DiscreteSymbol] = set()
+        self.waiting: list[tuple[Value, Value]] = []
+        self.postpones = True
         self.initially: dict[DiscreteSymbol, Value] = {}
         self.ticks: dict[Sampled, DiscreteSymbol] = {}
 

@@ -67,6 +67,11 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     """A start, where one side is a variable and the other is known beforehand; otherwise an equation at the start."""
     c = scope.component
     left, right = present(_unwrapped(left)), present(_unwrapped(right))
+    if isinstance(left, sympy.Basic) and left == right:
+        return
+    if _waits(scope, left, right) or _waits(scope, right, left):
+        scope.waiting.append((left, right))
+        return
     for a, b in ((left, right), (right, left)):
         known = _in_parameters(b)
         if isinstance(a, DiscreteSymbol) and a not in scope.said:
@@ -93,6 +98,23 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     a, b = (float(_numerical(scope, sympy.sympify(side))) for side in (left, right))
     if not math.isclose(a, b):  # a text has up to sixteen digits
         raise ModelError(f"the initial equation {left} = {right} does not hold for the declared starts")
+
+
+def _waits(scope: Scope, a: Value, b: Value) -> bool:
+    """True for a discrete variable that is what another one is, of which nothing is said yet."""
+    found = b.free_symbols if isinstance(b, sympy.Basic) else set()
+    unsaid = any(isinstance(s, DiscreteSymbol) and s not in scope.said for s in found)
+    return scope.postpones and isinstance(a, DiscreteSymbol) and unsaid
+
+
+def hold_waiting(scope: Scope) -> None:
+    """Holds what initial equations say of discrete variables in terms of others, each after these; what is said of none
+    of them counts as declared."""
+    while scope.waiting:
+        before, scope.waiting = scope.waiting, []
+        for left, right in before:
+            _hold_initially(scope, left, right)
+        scope.postpones = len(scope.waiting) < len(before)
 
 
 def _numerical(scope: Scope, value: Value) -> Value:

@@ -41,7 +41,7 @@ class Aftermath(NamedTuple):
     - `armed`: the side of zero on which each guard is, shape (guards,).
     - `left`: the events still to happen, shape (clocks + guards,).
     - `caused`, `stuck`: guards that an event of this instant made true, and guards that one left at zero, about to fall
-        again, shape (guards,).
+        again, shape (guards,); `later`: guards that turn when repeated events are over, shape (guards,).
     """
 
     q: Array
@@ -51,6 +51,7 @@ class Aftermath(NamedTuple):
     left: Array
     caused: Array
     stuck: Array
+    later: Array
 
 
 class _Outlook(NamedTuple):
@@ -79,7 +80,8 @@ def aftermath(
     left = instant.left & ~now.these
     if not g:
         slope = problem.slope(t, x, q, args)
-        return Aftermath(q, slope, jnp.ones_like(x), instant.state.armed, left, instant.caused, instant.stuck)
+        unchanged = instant.caused, instant.stuck, instant.later
+        return Aftermath(q, slope, jnp.ones_like(x), instant.state.armed, left, *unchanged)
     written_q = q
     problem, t, time, x, q, delay, args = still(constant_once((problem, t, time, x, q, now.delay, args)))
     instant, now = still(instant), now._replace(delay=delay)
@@ -95,8 +97,8 @@ def aftermath(
     outlook = _outlook(problem, (t, time, x, q, delay, args), instant, arrival, ahead, is_flat)
     written_q = jnp.where(outlook.flips, 1.0 - written_q, written_q) if problem.facts.choices else written_q
     slow = (jnp.abs(outlook.earlier - outlook.slope) <= STEADY * jnp.abs(outlook.slope)).astype(x.dtype)
-    side, next_ones, caused, stuck = _sides(problem, instant, arrival, now, left, turns_back, outlook, is_flat)
-    return Aftermath(written_q, outlook.slope, slow, side, jnp.concatenate([left[:c], next_ones]), caused, stuck)
+    side, next_ones, *others = _sides(problem, instant, arrival, now, left, turns_back, outlook, is_flat)
+    return Aftermath(written_q, outlook.slope, slow, side, jnp.concatenate([left[:c], next_ones]), *others)
 
 
 def _outlook(
@@ -142,9 +144,9 @@ def _outlook(
 def _sides(
     problem: AbstractHybridProblem, instant: Instant, arrival: Arrival, now: Happening, left: Array, turns_back: Array,
     outlook: _Outlook, is_flat: Callable[[Array, Array], Array],
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
     """Returns (the sides of the guards after an event, the guards whose events happen next, those that an event of this
-    instant made true, those that are stuck)."""
+    instant made true, those that are stuck, those that turn when repeated events are over)."""
     c = problem.facts.n_clocks
     relations = problem.facts.are(EventFlag.RELATION)
     repeated = problem.facts.are(EventFlag.REPEATED)[c:]
@@ -171,10 +173,8 @@ def _sides(
     landed = landed & (now.moved | (left[c:] & instant.caused)) & problem.facts.true_at_zero & ~relations[c:]
     stays = (left[c:] & now.onto & (value == 0)) | equal | landed
     falls = (falling * arrival.span < -band) & ~now.waits
-    if repeated.any():
-        # While discrete equations are repeated, time stands still: what an event makes move turns in the next step.
-        falls = falls & left[c:]
-        stays = stays | (left[c:] & jnp.asarray(relations[c:]) & reached)
+    if repeated.any():  # what crosses at this instant does so whatever the others change
+        stays = stays | (left[c:] & ~instant.later & jnp.asarray(relations[c:]) & reached)
     true = jnp.where(zero, falls | stays, value < 0)
     was_armed = ((armed > 0) & ~here) | (turns_back & (event >= c)) | (now.rose & ~here) | repeated
     # What this event made true happens next. A pending event still happens, even if a state was set anew: unless the
@@ -183,6 +183,8 @@ def _sides(
     caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & (~zero | equal | landed)
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     rests = was_armed | left[c:] | (falling * arrival.span > band)  # an event that was undone may happen later
+    # While discrete equations are repeated, time stands still: what they make move turns thereafter.
+    later = zero & falls & ~stays & (~left[c:] | instant.later) if repeated.any() else instant.later
     side = jnp.where(zero, jnp.where(rests, RESTS, BELOW), ABOVE)
     side = jnp.where(true, jnp.where(next_ones, ABOVE, BELOW), side)
     # If the event leaves its own guard at zero, the guard's rate says whether it falls on or has turned. A rate below
@@ -197,4 +199,4 @@ def _sides(
     sinks = pull * (SINKING * arrival.span) >= rise + jnp.sqrt(rise**2 + 4 * pull * band)
     held = flat & (pull > 0) & (rise**2 <= 4 * pull * band) & sinks  # it would rise to twice the band
     stuck = ((here & now.moved & (side == RESTS)) | instant.stuck) & held
-    return side.astype(armed.dtype), next_ones, caused, stuck
+    return side.astype(armed.dtype), next_ones, caused, stuck, later

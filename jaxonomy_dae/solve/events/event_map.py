@@ -65,7 +65,8 @@ def handle(
     start = Instant(
         state=state, left=arrival.due, caused=arrival.jumped, delay=jnp.zeros_like(t), time=t, round=first,
         before=state.x, approach=arrival.slope, previous=state.q, slope=arrival.slope, arrived=state.x,
-        stuck=jnp.zeros((problem.facts.n_guards,), bool), noted=noted, wrote=events.rivals.nobody,
+        stuck=jnp.zeros((problem.facts.n_guards,), bool), later=jnp.zeros((problem.facts.n_guards,), bool),
+        noted=noted, wrote=events.rivals.nobody,
     )  # fmt: skip
     length = _most_in_turn(problem)
     # Loops of fixed length, whose bodies are skipped where nothing is left: reverse mode cannot go back over a `while`.
@@ -144,8 +145,8 @@ class _Events(NamedTuple):
         # need not be finite.
         candidates, begun = instant.left, instant.round & instant.left
         if self.last.any():
-            candidates = candidates & ~(self.last & jnp.any(candidates & ~self.last))
-            begun = begun & ~self.last  # they read what all others have left
+            candidates = self._first_ones(instant)
+            begun = begun & candidates & ~self.last  # they read what all others have left
         goes_on = jnp.any(begun)
         together = candidates & (instant.round | ~goes_on)
         base, base_slope, previous = (
@@ -198,9 +199,17 @@ class _Events(NamedTuple):
             slope=after.slope,
             arrived=instant.arrived,
             stuck=after.stuck,
+            later=after.later,
             noted=self._noted(instant, now, logged, time, sides),
             wrote=wrote,
         )
+
+    def _first_ones(self, instant: Instant) -> Array:
+        """The events that are left and wait for no other one."""
+        later = jnp.concatenate([jnp.zeros((self.problem.facts.n_clocks,), bool), instant.later])
+        first = instant.left & ~later & ~self.last
+        last = instant.left & self.last
+        return jnp.where(jnp.any(first), first, jnp.where(jnp.any(last), last, instant.left))
 
     def _happening(self, instant: Instant, event: Array) -> Happening:
         """The event, when it happens, and what happens with it; whether it writes states is not known yet."""

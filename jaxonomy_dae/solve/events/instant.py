@@ -30,6 +30,7 @@ class Instant(eqx.Module):
     - `slope`: dx/dt after the last event.
     - `arrived`: the continuous state before the instant.
     - `stuck`: the guards that an event has left at zero, about to fall again, shape (guards,).
+    - `later`: the guards at zero that turn when repeated events are over, shape (guards,).
     - `noted`: the events of this instant that are listed.
     - `wrote`: which event of this round wrote each contested place last.
     """
@@ -46,6 +47,7 @@ class Instant(eqx.Module):
     slope: Array
     arrived: Array
     stuck: Array
+    later: Array
     noted: EventRows
     wrote: Array
 
