@@ -206,12 +206,13 @@ class Estimate:
     def effective(self) -> dict[str, float]:
         """The number of weights of each network that the data determine."""
         c, free, out = self.objective.coordinates, self.objective.free, {}
-        prior = self.minimum.weights.prior(self.minimum.z).jacobian
-        held = prior @ self.root[free]
+        # By the data's share, not by what priors leave: stiff priors and what nothing determines round away from one.
+        data = self.minimum.weights.informing[:, None] * self.minimum.found.jacobian
+        root = self.root[free]
+        along = data @ root
         for name in dict.fromkeys(g for g, w in zip(c.group, c.is_weight, strict=True) if w):
             chosen = np.array([g == name for g in c.group])[free]  # what is frozen is not determined
-            own = (prior[:, chosen] != 0).any(axis=1)
-            out[name] = float(chosen.sum() - np.sum(held[own] ** 2))
+            out[name] = float(np.sum(along * (data[:, chosen] @ root[chosen])))
         return out
 
     @property

@@ -15,7 +15,7 @@ from ..base.errors import ModelError, SimulationError, explained_keywords, keywo
 from ..run.simulation.simulate import simulate
 from ..run.system.system import AcausalSystem
 from ..solve.methods.solve import check_tolerances, default_tolerances
-from .asked import METHODS, as_asked, check_start, checked_method, names_to_train, penalties, started
+from .asked import METHODS, as_asked, check_start, checked_method, dead_times, names_to_train, penalties, started
 from .beginnings import GROWING as GRADUAL
 from .beginnings import beginning, silent
 from .clock import Clock
@@ -88,6 +88,9 @@ class Problem:
         laws.
     - `observe`: derived outputs by name, `{"gauge.y": law}`, with `law(solution)` of shape `(n,)`: a function, or an
         Equinox module whose weights may be trained.
+    - `delay`: dead times (s) of inputs and of what is measured, by name, in fits of runs: known numbers, or
+        `Unknown(guess)`. An input acts late, u(t − τ), with its first sample before; a sensor shows y(t − τ), and first
+        what it would show at the start.
     - `method`: `"single"`, each experiment is one run; `"growing"`, the same with growing `horizons`;
         `Shooting(...)`, multiple shooting, for what diverges; or for equations with errors, `Filter(...)`, the
         likelihood of a Kalman filter, or `Innovations(...)`, predictions one step ahead.
@@ -111,6 +114,7 @@ class Problem:
         priors: Mapping[str, Any] | None = None,
         regularize: Mapping[str, Any] | str | float | None = "evidence",
         observe: Mapping[str, Any] | None = None,
+        delay: Mapping[str, float | Unknown] | None = None,
         method: str | Shooting | Filter | Innovations = "single",
         rtol: float | None = None,
         atol: float | None = None,
@@ -140,6 +144,7 @@ class Problem:
         # Names of parameters, one by one, and of networks and sensor laws.
         self.trained = names_to_train(system, self.observers, train)
         self.method = checked_method(system, method)
+        self.delay = dict(delay or {})
         self._stacked = self.stacked(self.data)
         self._layout = self.layout_of(self._stacked)
         unknown = [*self.trained[0], *self._layout.shared, *self._layout.own]
@@ -171,13 +176,15 @@ class Problem:
             kind.append(name)
         if not parameters and not modules and not shared and not own and all(e.fixed for e in extras):
             raise ModelError(
-                "nothing is to be learned: name parameters, networks or sensor laws in train=, or make a start Unknown"
+                "nothing is to be learned: name parameters, networks or sensor laws in train=, or make a start or "
+                "a delay Unknown"
             )
         lengths = tuple(sorted(set(stacked.counts))) if self.observers else ()
         return Layout(
             stacked.outputs, parameters=tuple(parameters), modules=tuple(modules), shared=tuple(shared),
             own=tuple(own), known=tuple(known), kinds=stacked.kinds, options=tuple(self._options.items()),
-            extra=tuple(e.name for e in extras), lengths=lengths if len(lengths) > 1 else (), mesh=self._mesh,
+            extra=tuple(e.name for e in extras), delayed=tuple(self.delay),
+            lengths=lengths if len(lengths) > 1 else (), mesh=self._mesh,
         )  # fmt: skip
 
     @property
@@ -186,6 +193,8 @@ class Problem:
 
     def errors(self, stacked: Stacked) -> tuple[AbstractPredictor, tuple[Coordinate, ...]]:
         """How the method predicts outputs, and the coordinates that come with it."""
+        if self.delay:
+            return Runs(), dead_times(self.delay, stacked, self.method)
         if not isinstance(self.method, Filter | Innovations):
             return Runs(), ()
         structure, extras = structure_and_extras(self.method, self.system, stacked)
@@ -207,6 +216,7 @@ class Problem:
         model: AcausalSystem | None = None,
         *,
         starts: Mapping[str, Any] | None = None,
+        delay: Mapping[str, Any] | None = None,
         observe: Mapping[str, Any] | None = None,
         adjoint: Any = None,
     ) -> dict[str, dict[str, Any]]:
@@ -217,6 +227,7 @@ class Problem:
 
         - `model`: a system like the problem's, such as `equinox.combine(trainable, frozen)`; default: the problem's.
         - `starts`: unknown starts by names, scalars if shared, else shape `(experiments,)`; default: their guesses.
+        - `delay`: dead times by name, in place of the problem's numbers and guesses.
         - `observe`: sensor laws by name, in place of the problem's.
         - `adjoint`: as in `simulate`; `diffrax.ForwardMode()` for Jacobians.
 
@@ -227,7 +238,7 @@ class Problem:
         s = self._stacked
         objective = self.objective_of(s, self.coordinates_of(self._setting, s))
         model = self.system if model is None else model.merged()
-        return residuals(objective, model, dict(starts or {}), dict(observe or {}), adjoint)
+        return residuals(objective, model, dict(starts or {}), dict(delay or {}), dict(observe or {}), adjoint)
 
     def objective_of(self, stacked: Stacked, c: Coordinates, penalties: dict[str, Any] | None = None) -> Objective:
         """The function that a fit minimises."""
