@@ -60,7 +60,8 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
         for d in model.declarations
         if d.value is not None and is_discrete(d.name)
     ]
-    candidates = [(s, _definable(s, is_discrete, by_when)) for s in [*others, *bindings]]
+    given = by_when | {n for section in algorithms for n in with_entries(assigned_in(section), model)}
+    candidates = [(s, _definable(s, is_discrete, given)) for s in [*others, *bindings]]
     equations: list[tree.Statement] = [s for s, sides in candidates if not sides]
     matched, left = _matched([(s, sides) for s, sides in candidates if sides], is_discrete)
     of: dict[str, tree.Expression | int] = {**matched}
@@ -77,6 +78,8 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
             else:
                 equations.append(tree.Equality(tree.Reference((name,)), OfAlgorithm(k, name), section[0].line))  # type: ignore[arg-type]
     read_before = set(with_entries(_read_before((model.equations, model.algorithms, tuple(bindings))), model))
+    for section in algorithms:
+        read_before |= {n for n in remembered(section, model) if is_discrete(n)}
     followed = [name for name in of if name in read_before and name not in by_when]
     return DiscreteDefinitions(
         of=of, stored=by_when | set(followed), followed=followed, equations=equations, whens=whens, sections=sections,
@@ -135,16 +138,17 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
 
 
 def _definable(
-    s: tree.Statement, is_discrete: Callable[[str], bool], by_when: set[str]
+    s: tree.Statement, is_discrete: Callable[[str], bool], given: set[str]
 ) -> list[tuple[str, tree.Expression]]:
-    """The variables that an equation can determine, each with its value."""
+    """The variables that an equation can determine, each with its value; `given` are those that whens and algorithms
+    determine."""
     if not isinstance(s, tree.Equality):
         return []
     out = []
     for side, other in ((s.left, s.right), (s.right, s.left)):
         if isinstance(side, tree.Reference):
             name = _name(side)
-            if is_discrete(name) and name not in by_when:
+            if is_discrete(name) and name not in given:
                 out.append((name, other))
     return out
 
@@ -202,6 +206,48 @@ def _name(e: tree.Reference) -> str:
     """The name of what a reference stands for; a subscript that is not a number is '?' in it."""
     numbers = [",".join(str(getattr(x, "value", "?")) for x in s) for s in e.subscripts]
     return ".".join(f"{part}[{n}]" if n else part for part, n in zip(e.parts, numbers, strict=True))
+
+
+def remembered(section: tuple[tree.Statement, ...], model: tree.Class) -> set[str]:
+    """The variables of an algorithm whose value before it matters: they are read before they are assigned, or not
+    assigned in every case (Modelica Language Specification 3.6, 11.1.2).
+
+    **Raises:**
+
+    - `ModelError` for a `break` or `return` outside of a loop.
+    """
+    own = set(with_entries(assigned_in(section), model))
+    found: set[str] = set()
+
+    def entries(names: Iterable[str]) -> set[str]:
+        return set(with_entries(names, model)) & own
+
+    def read(part: object, done: set[str]) -> None:
+        found.update(entries(_name(e) for e in tree.each_part(part) if isinstance(e, tree.Reference)) - done)
+
+    def carried_out(statements: tuple[tree.Statement, ...], done: set[str]) -> set[str]:
+        """The variables that are assigned for sure after statements; `done` are those before."""
+        for s in statements:
+            if isinstance(s, tree.Assignment | tree.Equality):
+                read(s.right, done)
+                done = done | entries(assigned_in((s,)))
+            elif isinstance(s, tree.Loop):
+                done = done | entries(assigned_in((s,)))
+            elif isinstance(s, tree.Branches):
+                read(tuple(c for c, _ in s.branches), done)
+                ends = [carried_out(body, done) for _, body in s.branches]
+                ends += [] if s.branches[-1][0] == tree.Truth(True) else [done]
+                done = set.intersection(*ends)
+                found.update(entries(assigned_in((s,))) - done)
+            elif isinstance(s, tree.Jump):
+                raise ModelError(
+                    f"line {s.line}: '{s.kind}' stands outside of a loop: which statements it leaves out is lost where "
+                    "the loop has been written out"
+                )
+        return done
+
+    found |= own - carried_out(section, set())
+    return found
 
 
 def with_entries(names: Iterable[str], model: tree.Class) -> list[str]:

@@ -48,6 +48,7 @@ class Scope:
     - `kept`: relations whose truth is kept between events.
     - `names`: names of long expressions of functions.
     - `initial`: the discrete variable that says how far the initial time is; None if nothing asks for it.
+    - `carried_out`: what algorithms assign, by their numbers.
     - `said`: the discrete variables of which initial equations say what they are; `initially`: what that is, where it
       is not known beforehand. `waiting`: initial equations of discrete variables that wait for others, which they do
       while `postpones` is true.
@@ -88,6 +89,7 @@ class Scope:
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
         self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.initial: DiscreteSymbol | None = None
+        self.carried_out: dict[int, dict[str, Value]] = {}
         self.said: set[DiscreteSymbol] = set()
         self.waiting: list[tuple[Value, Value]] = []
         self.postpones = True
@@ -237,6 +239,8 @@ class Scope:
             is_declared = d.name in self.component.variables
             signal = VariableSymbol(d.name) if is_declared else self.component.input(d.name)
             return sympy.Gt(signal, 0.5) if self.kind(d.type) == "Boolean" else sympy.floor(signal + 0.5)
+        if found is None and "input" not in d.prefixes:
+            raise ModelError(f"line {d.line}: nothing determines '{d.name}': it has neither an equation nor a when")
         if found is None:  # an input of the model that nothing drives
             start = self._start(d.modifiers.get("start")) or self._least(d.type)
             return bool(start) if self.kind(d.type) == "Boolean" else int(start)
@@ -251,9 +255,12 @@ class Scope:
 
     def algorithm(self, number: int) -> dict[str, Value]:
         """What an algorithm assigns."""
-        assigned, kept = self.definitions.assigned[number], self.definitions.stored
-        stored = {n: previous(self.stored(n)) for n in assigned if n in kept}
-        return self.interpreter.assigned_by(self.definitions.algorithms[number], stored)
+        if number not in self.carried_out:
+            assigned, kept = self.definitions.assigned[number], self.definitions.stored
+            stored = {n: previous(self.stored(n)) for n in assigned if n in kept}
+            statements = self.definitions.algorithms[number]
+            self.carried_out[number] = self.interpreter.assigned_by(statements, stored)
+        return self.carried_out[number]
 
     # --- declarations ------------------------------------------------------------------------------------------------
 

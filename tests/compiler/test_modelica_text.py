@@ -508,8 +508,13 @@ def test_at_a_tick_pre_is_the_value_before_it():
     ("equations", "told"),
     [
         ("when time > 1.0 then a = b; end when; when time > 2.0 then b = a; end when;", "a → b → a depend"),
-        ("when time > 1.0 then a = 1; end when; when time > 2.0 then a = b; b = 2; end when;", "'a' is assigned by two"),
+        (
+            "when time > 1.0 then a = 1; end when; when time > 2.0 then a = b; b = 2; end when;",
+            "'a' is assigned by two",
+        ),
         ("when time > a then a = 1; end when; b = pre(b) + b;", "b → b depend"),
+        ("b = 1; algorithm if time > 1.0 then break; end if; a := 1;", "'break' stands outside of a loop"),
+        ("when time > a then a = 1; end when;", "nothing determines 'b'"),
     ],
 )
 def test_discrete_equations_that_have_no_order_are_refused(equations, told):
