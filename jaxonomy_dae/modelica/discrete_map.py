@@ -16,7 +16,7 @@ not in the iteration before, and pre(m) otherwise (sections 8.3.5 and 11.2.7).
 
 import functools
 import graphlib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import sympy
 
@@ -156,8 +156,10 @@ class DiscreteMap:
         solves = EventFlag.AT_START | EventFlag.REVOCABLE | EventFlag.REPEATED
         names = ", ".join(f"'{s.path}'" for s in new) or "whens"
         starting, started = scope.phase(STARTING), negated(scope.phase(STARTING))
+        initial = scope.initial
+        assert initial is not None
         before = [Assign(previous(m), m) for m in new]
-        c._event(starting, (*before, Assign(scope.initial, sympy.Integer(AT_FIRST))), None, solves, f"start of {names}")
+        c._event(starting, (*before, Assign(initial, sympy.Integer(AT_FIRST))), None, solves, f"start of {names}")
         differs = [self._differs(m, n) for m, n in new.items()]
         pending = self._number("pending", both(started, functools.reduce(either, differs, False)))
         unsettled = pending is not None
@@ -174,8 +176,8 @@ class DiscreteMap:
             *(Assign(m, n) for m, n in new.items()),
             *(Assign(previous(m), n) for m, n in new.items()),
             *(Assign(was, now) for now, was in self._conditions),
-            *(Assign(tick, _unless(pre(scope.initial), pre(tick))) for tick in scope.ticks.values()),
-            Assign(scope.initial, sympy.Integer(STARTED)),
+            *(Assign(tick, _unless(pre(initial), pre(tick))) for tick in scope.ticks.values()),
+            Assign(initial, sympy.Integer(STARTED)),
         ]
         ends = [(scope.hidden(f":ends[{k}]", 0), text, when) for k, (when, text) in enumerate(self._ends)]
         actions += [Assign(done, as_number(when)) for done, _, when in ends]
@@ -212,7 +214,7 @@ def _shown(scope: Scope, truth: Value) -> str:
         return str(truth)
     names: dict[sympy.Basic, sympy.Basic] = {scope.phase(STARTED): sympy.true}
     for clock, tick in scope.ticks.items():
-        period = sympy.sympify(clock.period)
+        period: Any = sympy.sympify(clock.period)
         names[sympy.Eq(tick, 1)] = sympy.Symbol(f"sampled({f'{float(period):g}' if period.is_number else period})")
     for s in truth.free_symbols:
         if isinstance(s, DiscreteSymbol) and s != scope.initial and s not in scope.ticks.values():

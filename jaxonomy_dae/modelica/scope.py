@@ -83,8 +83,9 @@ class Scope:
         self.final: dict[str, Value] = {}
         self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
         self.declared = {d.name: d for d in flat.model.declarations}
-        for known, new in zip((self.entries, self.fields), _gather(self.declared), strict=True):
-            known.update(new)
+        entries, fields = _gather(self.declared)
+        self.entries.update(entries)
+        self.fields.update(fields)
         self.definitions = find_definitions(self.flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
         self.ends: set[sympy.Basic] = set()  # conditions that end the run

@@ -67,7 +67,7 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     """A start, where one side is a variable and the other is known beforehand; otherwise an equation at the start."""
     c = scope.component
     left, right = present(_unwrapped(left)), present(_unwrapped(right))
-    if isinstance(left, sympy.Basic) and left == right:
+    if _is_same(left, right):
         return
     if _waits(scope, left, right) or _waits(scope, right, left):
         scope.waiting.append((left, right))
@@ -98,6 +98,10 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     a, b = (float(_numerical(scope, sympy.sympify(side))) for side in (left, right))
     if not math.isclose(a, b):  # a text has up to sixteen digits
         raise ModelError(f"the initial equation {left} = {right} does not hold for the declared starts")
+
+
+def _is_same(left: Value, right: Value) -> bool:
+    return isinstance(left, sympy.Basic) and left == right
 
 
 def _waits(scope: Scope, a: Value, b: Value) -> bool:

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import sympy
 
 from ..base.errors import ModelError
-from ..write.symbols import DiscreteSymbol
+from ..write.symbols import DiscreteSymbol, VariableSymbol
 from . import tree
 from .definitions import assigned_in, with_entries
 from .discrete_map import DiscreteMap
@@ -121,8 +121,10 @@ def _act(found: DiscreteMap, acts: Value, target: Target, value: Value) -> None:
     """What a branch does beside assigning."""
     if isinstance(target, str):
         found.end(acts, target)
-    else:
+    elif isinstance(target, VariableSymbol):
         found.reinit(acts, target, value)
+    else:
+        raise ModelError(f"reinit takes a state; got {target}")
 
 
 def _conditions(scope: Scope, condition: tree.Expression, names) -> Iterator[tuple[Value, bool]]:

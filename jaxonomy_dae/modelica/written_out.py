@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 from ..base.errors import ModelError
 from . import tree
@@ -55,7 +56,7 @@ def entries_of(
         )  # fmt: skip
 
 
-def _with(part: object, values: Mapping[str, tree.Number]):
+def _with(part: Any, values: Mapping[str, tree.Number]) -> Any:
     """A part of the tree with numbers for iterators."""
     if isinstance(part, tree.Reference) and part.path in values and not any(part.subscripts):
         return values[part.path]
