@@ -126,9 +126,7 @@ def test_what_an_fmu_holds(ball, tmp_path):
     assert ball.stat().st_size < 100_000
     sources = tmp_path / "sources"
     command = [*(compiler_for(this_platform()) or ()), *FLAGS, "-Wall", "-Wextra", "-Werror", "-O0"]
-    done = subprocess.run(
-        [*command, "fmi3_model_exchange.c", "-o", "x.so", "-lm"], cwd=sources, capture_output=True, text=True
-    )
+    done = subprocess.run([*command, "fmi3.c", "-o", "x.so", "-lm"], cwd=sources, capture_output=True, text=True)
     assert not done.returncode, done.stderr
     symbols = subprocess.run(["nm", "-D", "--defined-only", "x.so"], cwd=sources, capture_output=True, text=True)
     assert symbols.stdout and all(line.split()[-1].startswith("fmi3") for line in symbols.stdout.splitlines())
