@@ -33,7 +33,8 @@ class Content:
         self.outputs = [n for n in self.wanted if n not in own]
         self.programs = Programs(system, self.outputs, fixed, functions)
         self.layout = Layout.of(self.programs)
-        self.slope_names = [_name_of_slope(name) for name in states]
+        own_names = set(map(structured, states))
+        self.slope_names = [_name_of_slope(name, own_names) for name in states]
         self.guard_names = [f"events.guard[{k + 1}]" for k in range(self.programs.ng)]
 
     def _outputs(self, outputs: Sequence[str] | None) -> list[str]:
@@ -99,6 +100,8 @@ def _rows_of_start(plan: SystemPlan, starts: Sequence[str]) -> list[str]:
     return [*equations, *(plan.describe(int(e)) for found in left for e in found.equation), *names]
 
 
-def _name_of_slope(state: str) -> str:
+def _name_of_slope(state: str, states: set[str]) -> str:
+    """The name of a state's derivative: der(x), or der(x,1) where der(x) is a state itself."""
     order, inner = inner_name(state)
-    return structured("der(" * (order + 1) + inner + ")" * (order + 1))
+    name = structured("der(" * (order + 1) + inner + ")" * (order + 1))
+    return f"{name[:-1]},1)" if name in states else name
