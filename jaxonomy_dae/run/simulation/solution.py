@@ -21,7 +21,7 @@ from ...compile.lowering.gather import times
 from ...host.cache import compiled
 from ...host.platform import precisely
 from ...host.rows import at_times, filled_up, fit, size_for
-from ...host.staging import is_staged, is_traced, on_device, picked
+from ...host.staging import as_argument, is_staged, is_traced, on_device, picked
 from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
 from .amplified import amplified, is_looked_at, sentence
@@ -164,7 +164,7 @@ class Solution(eqx.Module):
         few = fit(ts.shape[0], plan.extended.quantities.n) or is_looked_at(self.system)
         owners = None if few else plan.owners(quantity)
         place = quantity if owners is None else np.searchsorted(plan.owned(owners), quantity)
-        padded = on_device(np.resize(place, n)), on_device(np.resize(factor, n), self.states.dtype)
+        padded = as_argument(np.resize(place, n)), as_argument(np.resize(factor, n), self.states.dtype)
         return _chosen(self.system.without_stiffness, ts, states, self.inputs, discrete, *padded, owners)
 
     def _where_reached(self, values: Numeric) -> Numeric:

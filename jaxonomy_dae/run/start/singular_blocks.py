@@ -212,6 +212,12 @@ def _causes(plan: SystemPlan, known: Known, block: Block, rank: Rank | SparseRan
     return tuple([c for c in moved if c[1] == 0.0] or found or moved or touched)
 
 
+@remembered
+def _constraint_block(plan: SystemPlan) -> Block:
+    """The hidden constraints, whose unknowns are the states."""
+    return Block(tuple(planned.equation for planned in plan.constraints), plan.states)
+
+
 def _constraints(plan: SystemPlan, known: Known) -> Iterator[BlockFinding]:
     """Hidden constraints that depend on each other at the state: the projection could not tell them apart."""
     m, values, groups = plan.n_constraints, known.at.values, tuple(planned.equation for planned in plan.constraints)
@@ -219,7 +225,9 @@ def _constraints(plan: SystemPlan, known: Known) -> Iterator[BlockFinding]:
         return
     if any(np.isnan(values[group.quantity]).any() or group.template.opaque is not None for group in groups):
         return
-    block = Block(groups, plan.states)
+    block = _constraint_block(plan)
+    if block.is_evident(known):
+        return
     rank, matrix = block.rank(known), block.jacobian(known).toarray()
     if rank is None or (rank.is_regular and rank.condition < ILL_CONDITIONED):
         return
