@@ -56,14 +56,14 @@ class Opened:
             found = self.model.updateDiscreteStates()
         return found
 
-    def forward(self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float]) -> np.ndarray:
+    def forward(self, unknowns: Sequence[str], knowns: Sequence[str], seed: Any) -> np.ndarray:
         return np.array(
             self.model.getDirectionalDerivative(
                 self.references(unknowns), self.references(knowns), list(map(float, seed)), len(unknowns)
             )
         )
 
-    def reverse(self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float], n: int) -> np.ndarray:
+    def reverse(self, unknowns: Sequence[str], knowns: Sequence[str], seed: Any, n: int) -> np.ndarray:
         return np.array(
             self.model.getAdjointDerivative(
                 self.references(unknowns), self.references(knowns), list(map(float, seed)), n
