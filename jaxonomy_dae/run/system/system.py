@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ...base.aliases import Time
@@ -124,7 +123,7 @@ class AcausalSystem(eqx.Module):
     @property
     def without_stiffness(self) -> "AcausalSystem":
         """The same for programs that choose no solver, which models share though one is stiffer than the other."""
-        return dataclasses.replace(self, stiffness=None)
+        return self if self.stiffness is None else dataclasses.replace(self, stiffness=None)
 
     # --- changing ----------------------------------------------------------------------------------------------
 
@@ -147,7 +146,7 @@ class AcausalSystem(eqx.Module):
     def _sizes_at(self, parameters: Parameters) -> Float[Array, "*batch quantities"]:
         """Typical sizes at other parameter values; the present ones where these are not known, or a batch."""
         known, plan = parameters.known, self.plan
-        if known is None or isinstance(self.typical_sizes, Tracer):
+        if known is None or is_traced(self.typical_sizes):
             return self.typical_sizes
         sizes = typical_sizes(plan.model, plan.flat.parameters.everything(known))
         with jax.ensure_compile_time_eval():
@@ -182,7 +181,7 @@ class AcausalSystem(eqx.Module):
         out: dict[str, Any] = {n: eqx.filter(self.neural[n], eqx.is_inexact_array) for n in names if n in self.neural}
         for name, entries in chosen.items():
             z = out[name] = unconstrained(self.parameters[name], table.ends.take(entries))
-            if not isinstance(z, Tracer) and not np.isfinite(z).all():
+            if not is_traced(z) and not np.isfinite(z).all():
                 places = np.broadcast_to(entries, np.shape(z))[~np.isfinite(z)]
                 one, interval = table.names[places[0]], table.intervals[places[0]]
                 raise ModelError(
