@@ -573,6 +573,24 @@ class AcausalSystem(eqx.Module):
             stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
         )  # fmt: skip
 
+    def to_c(
+        self,
+        path: Any,
+        *,
+        outputs: Sequence[str] | None = None,
+        functions: Sequence[str] | None = None,
+        stop_time: float = 1.0,
+        tolerance: float = 1e-6,
+        overwrite: bool = False,
+    ) -> Any:
+        """Writes this system as C99 into a folder: see `jaxonomy_dae.fmi.write_c`, which has the same arguments."""
+        from ...fmi.plain_c import write_c
+
+        return write_c(
+            self, path, outputs=outputs, functions=functions, stop_time=stop_time, tolerance=tolerance,
+            overwrite=overwrite,
+        )  # fmt: skip
+
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
         if isinstance(solve_for, str):
             raise ModelError(f"solve_for is a list of parameters' names; write solve_for=[{solve_for!r}]")
