@@ -31,6 +31,10 @@ def unrounded_sizes(
 ) -> Float[np.ndarray, " quantities"]:
     """As `typical_sizes` before rounding to powers of two. State selection compares sizes, and rounding could turn a
     small difference into a factor of two."""
+    # What events assign starts at one of its values, where a branch of an equation may be zero that has a size in all
+    # others: free friction says nothing of the force that friction has.
+    assigned = model.flat.parameters.changed_by_events
+    parameters = np.where(assigned[: len(parameters)], parameters * (1 + MOVED), parameters)
     return _balanced(model.extended, parameters, _declared_or_started(model, parameters))
 
 

@@ -56,8 +56,9 @@ def check(
     problem = report.problem
     if problem is not None:
         raise InitializationError(problem)
-    for text in report.warnings if stacklevel is not None else ():
-        warnings.warn(text, RuntimeWarning, stacklevel=stacklevel + 1)
+    if stacklevel is not None:
+        for text in report.warnings:
+            warnings.warn(text, RuntimeWarning, stacklevel=stacklevel + 1)
     if not solve_for:
         return found
     solved = np.asarray(found.solved)

@@ -189,7 +189,8 @@ class InitializationReport(Sections):
             return []
         parameters = np.asarray(self._system.numbers, float)
         values = np.asarray(self._system.observe(self.outranked, self.time, self._found.x, self._inputs), float)
-        starts = [Guess(row.name, row.start.value(parameters), v) for row, v in zip(rows, values.tolist(), strict=True)]
+        declared = [row.start.value(parameters) for row in rows if row.start is not None]
+        starts = [Guess(*one) for one in zip(self.outranked, declared, values.tolist(), strict=True)]
         left = [
             f"'{g.name}' = {g.value:.6g}, declared {g.guess:.6g}"
             for g, row in zip(starts, rows, strict=True)
@@ -200,27 +201,21 @@ class InitializationReport(Sections):
     def _warning_of_guesses(self) -> list[str]:
         plan, n = self._plan, len(self._rows.kept) - self._promoted
         held = {row.quantity for row in self._rows.kept[:n]}
-        parameters, inside, order = (
-            np.asarray(self._system.numbers, float),
-            integrated(plan),
-            plan.extended.quantities.order,
-        )
+        parameters, order = np.asarray(self._system.numbers, float), plan.extended.quantities.order
         left = []
         for row, value in zip(self._rows.guess, self._x.tolist(), strict=True):
             if row is None or row.start is None or row.quantity in held or order[row.quantity]:
                 continue
             guess = row.start.value(parameters) / row.factor
-            tells = inside[row.quantity] and abs(guess) > self._rounding(row.quantity)
+            tells = integrated(plan)[row.quantity] and abs(guess) > self._rounding(row.quantity)
             if tells and abs(value - guess) >= (1 - self._relative) * abs(guess):
                 left.append(f"'{plan.quantity_name[row.quantity]}' = {value:.6g}, guessed {guess:.6g}")
-        return (
-            [
-                f"the start is far from what is guessed: {', '.join(left)}. If this is another solution than the one that is "
-                "meant, give better guesses, or fix one of them"
-            ]
-            if left
-            else []
-        )
+        if not left:
+            return []
+        return [
+            f"the start is far from what is guessed: {', '.join(left)}. If this is another solution than the one that "
+            "is meant, give better guesses, or fix one of them"
+        ]
 
     def _rounding(self, quantity: int) -> float:
         """The size at which a number of this quantity is rounding beside others of the model."""
