@@ -8,10 +8,10 @@ import jax
 import numpy as np
 import scipy.sparse as sp
 
-from ...base.tolerances import DIGIT, HALF_OF_THE_DIGITS, ILL_CONDITIONED, TINY, ridge, solved
+from ...base.tolerances import DIGIT, HALF_OF_THE_DIGITS, ILL_CONDITIONED, KNOWN, TINY, ridge, solved
 from ...compile.diagnosis.lost_cancellation import lost_cancellation
 from ...compile.diagnosis.redundant_constraints import DependentConstraints, ModelAt, dependent_constraints, no_freedom
-from ...compile.diagnosis.wording import listed
+from ...compile.diagnosis.wording import listed, quoted
 from ...compile.lowering.plan import SystemPlan
 from ...compile.model.tables import ZERO
 from ...graph.judgement.sparse_rank import sparse_rank_of
@@ -19,8 +19,9 @@ from ..system.input_values import input_values
 from ..system.sections import SHOWN, Sections, some
 from .constraints_at import constraints_at
 from .initialize import InitialPoint, is_consistent
+from .integrated import integrated
 from .ladder import FAILED, METHODS, NEAREST
-from .rows import StartRow, initial_rows, supports
+from .rows import InitialRows, StartRow, initial_rows, supports
 from .singular_blocks import BlockFinding, examine_blocks
 from .sparse_newton import sparse_rows
 
@@ -88,7 +89,7 @@ class InitializationReport(Sections):
         self.time = float(t0)
         self.method = METHODS[int(found.method)]
         self.evaluations = int(found.evaluations)
-        self.outranked = list(self._rows.dropped)
+        self.outranked = [row.name for row in self._rows.dropped]
         self.solved = [(n, float(v)) for n, v in zip(solve_for, np.asarray(found.solved), strict=True)]
         self._residual = np.asarray(found.residual, float)
         self._target = np.asarray(found.target, float)[len(self._residual) - len(self._rows.kept) :]
@@ -172,6 +173,56 @@ class InitializationReport(Sections):
                 return ()
             found += names
         return tuple(dict.fromkeys(found))
+
+    # --- starts that do not hold -------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def warnings(self) -> list[str]:
+        """Texts about starts that a component declares and that do not hold: fixed ones that gave way to values given,
+        and guesses of what the model integrates that told no more than no guess would have, as they lie as far from the
+        value found as zero does."""
+        return [*self._warning_of_outranked(), *self._warning_of_guesses()]
+
+    def _warning_of_outranked(self) -> list[str]:
+        rows = self._rows.dropped
+        if not rows:
+            return []
+        parameters = np.asarray(self._system.numbers, float)
+        values = np.asarray(self._system.observe(self.outranked, self.time, self._found.x, self._inputs), float)
+        declared = [row.start.value(parameters) for row in rows if row.start is not None]
+        starts = [Guess(*one) for one in zip(self.outranked, declared, values.tolist(), strict=True)]
+        left = [
+            f"'{g.name}' = {g.value:.6g}, declared {g.guess:.6g}"
+            for g, row in zip(starts, rows, strict=True)
+            if not (self._is_kept(g) or abs(g.moved) <= self._rounding(row.quantity))
+        ]
+        return [outranked(self._rows, left)] if left else []
+
+    def _warning_of_guesses(self) -> list[str]:
+        plan, n = self._plan, len(self._rows.kept) - self._promoted
+        held = {row.quantity for row in self._rows.kept[:n]}
+        parameters, order = np.asarray(self._system.numbers, float), plan.extended.quantities.order
+        left = []
+        for row, value in zip(self._rows.guess, self._x.tolist(), strict=True):
+            if row is None or row.start is None or row.quantity in held or order[row.quantity]:
+                continue
+            guess = row.start.value(parameters) / row.factor
+            tells = integrated(plan)[row.quantity] and abs(guess) > self._rounding(row.quantity)
+            if tells and abs(value - guess) >= (1 - self._relative) * abs(guess):
+                left.append(f"'{plan.quantity_name[row.quantity]}' = {value:.6g}, guessed {guess:.6g}")
+        if not left:
+            return []
+        return [
+            f"the start is far from what is guessed: {', '.join(left)}. If this is another solution than the one that "
+            "is meant, give better guesses, or fix one of them"
+        ]
+
+    def _rounding(self, quantity: int) -> float:
+        """The size at which a number of this quantity is rounding beside others of the model."""
+        return KNOWN * float(self._system.typical_sizes[quantity]) if quantity != ZERO else 0.0
+
+    def _is_kept(self, g: Guess) -> bool:
+        return abs(g.moved) <= self._relative * max(abs(g.value), abs(g.guess))
 
     # --- residuals ---------------------------------------------------------------------------------------------
 
@@ -375,6 +426,10 @@ class InitializationReport(Sections):
         lines.append(f"{mend}, or remove from the model what has become superfluous.")
         return "\n".join(lines)
 
+    def _guess(self, g: Guess) -> str:
+        kept = "kept" if self._is_kept(g) else f"moved by {g.moved:.3g} from {g.guess:.6g}"
+        return f"{g.name} = {g.value:.6g}, {kept}"
+
     def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
         singular = [b for b in self.blocks if b.singular]
         state = "a consistent" if self.consistent else "no consistent"
@@ -395,7 +450,7 @@ class InitializationReport(Sections):
             ("redundant, as they follow from others", [_redundancy(r) for r in self.redundant if r.agrees]),
             ("contradicting", [_contradiction(r) for r in self.redundant if not r.agrees]),
             ("fixed in the model, but outranked by values given", self.outranked),
-            ("guesses", [_guess(g, self._relative) for g in self.guesses]),
+            ("guesses", [self._guess(g) for g in self.guesses]),
             ("does not hold, worst first", [f"{r.text}: off by {abs(r.value):.3g}" for r in self.residuals]),
             ("singular", [self._singular(b).replace("\n", " ") for b in singular]),
             ("notes", self.notes),
@@ -403,10 +458,13 @@ class InitializationReport(Sections):
         return head, [(title, list(entries)) for title, entries in sections if entries]
 
 
-def _guess(g: Guess, relative: float) -> str:
-    if abs(g.moved) <= relative * max(abs(g.value), abs(g.guess)):
-        return f"{g.name} = {g.value:.6g}, kept"
-    return f"{g.name} = {g.value:.6g}, moved by {g.moved:.3g} from {g.guess:.6g}"
+def outranked(rows: InitialRows, starts: Sequence[str]) -> str:
+    """The text of a warning: values given take the place of fixed starts."""
+    given = [row.name for row in rows.kept if row.given >= 0]
+    return (
+        f"initial={{...}}: {quoted(given)} determine{'s' * (len(given) == 1)} variables whose starts are fixed in the "
+        f"model, and what is given counts: {', '.join(starts)}. Give these variables instead, or values that agree"
+    )
 
 
 def _redundancy(r: Redundant) -> str:

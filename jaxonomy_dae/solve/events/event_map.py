@@ -64,7 +64,7 @@ def handle(
     events = _Events.of(problem, t, state, arrival, args, at_start)
     start = Instant(
         state=state, left=arrival.due, caused=arrival.jumped, delay=jnp.zeros_like(t), time=t, round=first,
-        before=state.x, approach=arrival.slope, previous=state.q, slope=arrival.slope, arrived=state.x,
+        before=state.x, approach=arrival.slope, previous=state.q, there=state.x, slope=arrival.slope, arrived=state.x,
         stuck=jnp.zeros((problem.facts.n_guards,), bool), later=jnp.zeros((problem.facts.n_guards,), bool),
         noted=noted, wrote=events.rivals.nobody,
     )  # fmt: skip
@@ -155,10 +155,11 @@ class _Events(NamedTuple):
         )
         now = self._happening(instant, jnp.where(jnp.any(together), jnp.argmax(together), c + g))
         event, delay = now.event, now.delay
-        # A step may end a rounding error off the tick: what equations read at a tick, they read at its own time.
-        time, reached = t + delay, state.x + instant.slope * delay
-        if c:  # and so does what the tick has caused
-            caused = (event >= c) & instant.caused[jnp.clip(event - c, 0, g - 1)] if g else np.False_
+        # What another event caused happens at the time of that one, where the state is what it left. The slope between
+        # them may be as large as you please, as that of parts that are held to see what force it takes.
+        caused = ~now.is_clock & instant.caused[jnp.clip(event - c, 0, max(g - 1, 0))] if g else jnp.array(False)
+        time, reached = t + delay, jnp.where(caused, instant.there, state.x + instant.slope * delay)
+        if c:  # a step may end a rounding error off the tick, at whose time equations read
             time = jnp.where(now.is_clock, now.tick, jnp.where(caused, instant.time, time))
         x, written = problem.written(time, reached, base + base_slope * delay, q, previous, now.these, args)
         now = now._replace(moved=jnp.any(x != reached) & ~self.relations[event])
@@ -196,6 +197,7 @@ class _Events(NamedTuple):
             before=base,
             approach=base_slope,
             previous=previous,
+            there=x,
             slope=after.slope,
             arrived=instant.arrived,
             stuck=after.stuck,

@@ -27,7 +27,7 @@ class Instant(eqx.Module):
     - `delay`: δ of the last event (second); `time`: when it happened.
     - `round`: the events that happen as one: all read what was before the first of them; what they cause comes after.
     - `before`, `approach`, `previous`: the continuous state before this round, its slope, and the discrete values.
-    - `slope`: dx/dt after the last event.
+    - `there`: the continuous state after the last event, at its own time; `slope`: dx/dt then.
     - `arrived`: the continuous state before the instant.
     - `stuck`: the guards that an event has left at zero, about to fall again, shape (guards,).
     - `later`: the guards at zero that turn when repeated events are over, shape (guards,).
@@ -44,6 +44,7 @@ class Instant(eqx.Module):
     before: Array
     approach: Array
     previous: Array
+    there: Array
     slope: Array
     arrived: Array
     stuck: Array
