@@ -7,7 +7,7 @@
 project). Each class is opened by the front end; its equations and unknowns are counted: of an open class, the flows of
 its connectors are determined outside. Then it becomes a component, each port of which meets a boundary whose flow is
 its potential, each input a constant, and the plant is compiled. Parameters without a value are 1. Classes that are
-partial, and those without connectors, are counted apart. `MEDIA` gives the medium to classes that have none.
+partial, and those without connectors, are counted apart. `GIVEN` holds what some classes do not have by themselves.
 
 Classes run in a process that is replaced when one of them takes too long. Lines of JSON go to `--out`, from where a
 second call goes on; the table by sub-library and the reasons go to `--page`.
@@ -37,19 +37,45 @@ from jaxonomy_dae.modelica.sources import Sources
 STAGES = ("found", "opened", "balanced", "translated", "compiled")
 SECONDS = 30  # of processor time, for each class after the first
 MEMORY = 6 << 30  # bytes of memory
-MEDIA = {"Modelica.Fluid.": "redeclare package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater"}
+WATER = "redeclare package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater"
+GIVEN = {  # modifications of classes whose names begin so: the first that fits
+    "Modelica.Fluid.Vessels.": f"{WATER}, nPorts = 1, use_portsData = false",
+    "Modelica.Fluid.Sources.": f"{WATER}, nPorts = 1",
+    "Modelica.Fluid.": WATER,
+    "Modelica.Mechanics.MultiBody.World": "enableAnimation = false",
+}
 
 
 class Boundaries(Component):
-    """A port for each port of a class; the flow into each is its potential."""
+    """A port for each port of a class; the flow into each is its potential, and each stream leaves it with the value 1.
+
+    A tree of frames that begins in none of the class's ports begins here, in a frame that stands still. Upon the other
+    frames act a force and a torque that grow with their place and their rotation.
+    """
 
     def __init__(self, ev: EqnEnv, name: str, of: OpenClass):
         super().__init__(ev, name)
+        first = True
         for k, port in enumerate(of.ports):
             domain = domain_of(port)
             mine = self.port(f"p{k}", domain)
-            for (across, _), (through, _) in zip(domain.across, domain.through, strict=True):
-                self.add_equations(Eq(getattr(mine, through), getattr(mine, across)))
+            across, through = ([self[f"p{k}.{n}"] for n, _ in side] for side in (domain.across, domain.through))
+            streams = [self[f"p{k}.{n}"] for n, _ in domain.streams]
+            self.add_equations(*(Eq(h, 1) for h in streams))
+            reached = {b for _, b in of.branches} | set(of.roots)
+            if not port.orientation:
+                self.add_equations(*(Eq(f, p) for f, p in zip(through, across, strict=True)))
+            elif port.name in reached:
+                self.add_equations(
+                    *(Eq(f, p) for f, p in zip(through[:3], across[:3], strict=True)),
+                    *(Eq(t, self[f"p{k}.R.T[{i}]"]) for t, i in zip(through[3:], ("2,3", "3,1", "1,2"), strict=True)),
+                )
+            else:
+                still = [0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]
+                self.declare_root(mine)
+                across[:3] = [*across[:3]] if first else [*through[:3]]
+                first = False
+                self.add_equations(*(Eq(p, x) for p, x in zip(across, still, strict=True)))
 
 
 def main() -> int:
@@ -142,8 +168,7 @@ def row_of(library: Library, name: str) -> dict:
 
 def _stages(library: Library, name: str, row: dict):
     yield "found"
-    medium = next((text for prefix, text in MEDIA.items() if name.startswith(prefix)), "")
-    found = library.opened(name, medium)
+    found = library.opened(name, next((text for prefix, text in GIVEN.items() if name.startswith(prefix)), ""))
     row["connectors"] = len(found.ports) + len(found.inputs) + len(found.outputs)
     yield "opened"
     values: dict[str, Any] = dict.fromkeys(found.required, 1.0)

@@ -14,6 +14,7 @@ from typing import TypeVar
 import sympy
 
 from ..base.errors import ModelError
+from ..graph.expressions.from_sympy import symbols_of
 from ..write.component import Component
 from ..write.events import terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, der
@@ -327,7 +328,7 @@ class Scope:
         value = self.evaluate(e)
         if is_condition(value):
             value = as_number(value)
-        if isinstance(value, sympy.Expr) and any(not isinstance(s, ParameterSymbol) for s in value.free_symbols):
+        if isinstance(value, sympy.Expr) and any(not isinstance(s, ParameterSymbol) for s in symbols_of(value)):
             return None
         return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
@@ -335,7 +336,7 @@ class Scope:
         """A hidden parameter or variable that is equal to an expression of a function."""
         if e in self.names:
             return self.names[e]
-        symbols = e.free_symbols
+        symbols = symbols_of(e)
         known_before = PreviousSymbol | DiscreteSymbol if self.in_action else PreviousSymbol
         if any(isinstance(s, known_before) for s in symbols):  # a variable would have the value of another side
             return e
@@ -396,7 +397,7 @@ class Scope:
 
 
 def _is_of_parameters(value: sympy.Expr) -> bool:
-    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in value.free_symbols)
+    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols_of(value))
 
 
 T = TypeVar("T")
@@ -434,4 +435,4 @@ def before(value: Value) -> Value:
     """A value before the event."""
     if not isinstance(value, sympy.Basic):
         return value
-    return value.xreplace({s: PreviousSymbol(s.path) for s in value.free_symbols if isinstance(s, DiscreteSymbol)})
+    return value.xreplace({s: PreviousSymbol(s.path) for s in symbols_of(value) if isinstance(s, DiscreteSymbol)})
