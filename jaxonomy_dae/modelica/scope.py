@@ -15,6 +15,7 @@ import sympy
 
 from ..base.aliases import Condition
 from ..base.errors import ModelError
+from ..graph.expressions.from_sympy import symbols_of
 from ..write.component import Component
 from ..write.events import NO_FLAG, Assign, Sampled, terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
@@ -354,7 +355,7 @@ class Scope:
         value = self.evaluate(e)
         if is_condition(value):
             value = as_number(value)
-        if isinstance(value, sympy.Expr) and any(not isinstance(s, ParameterSymbol) for s in value.free_symbols):
+        if isinstance(value, sympy.Expr) and any(not isinstance(s, ParameterSymbol) for s in symbols_of(value)):
             return None
         return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
@@ -423,7 +424,7 @@ class Scope:
 
 
 def _is_of_parameters(value: sympy.Expr) -> bool:
-    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in value.free_symbols)
+    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols_of(value))
 
 
 T = TypeVar("T")
@@ -465,7 +466,7 @@ def previous(value: Value) -> Value:
         return Record({k: previous(v) for k, v in value.items()})
     if not isinstance(value, sympy.Basic):
         return value
-    found = {s: s.path for s in value.free_symbols if isinstance(s, DiscreteSymbol)}
+    found = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
     return value.xreplace({s: DiscreteSymbol(f":pre({n})") for s, n in found.items() if not n.startswith(":")})
 
 
@@ -473,5 +474,5 @@ def present(value: Value) -> Value:
     """A value with what it reads of the iteration before as it is now: at the initial time they are the same."""
     if not isinstance(value, sympy.Basic):
         return value
-    names = {s: s.path for s in value.free_symbols if isinstance(s, DiscreteSymbol)}
+    names = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
     return value.xreplace({s: DiscreteSymbol(n[5:-1]) for s, n in names.items() if n.startswith(":pre(")})
