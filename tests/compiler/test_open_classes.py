@@ -10,6 +10,7 @@ from device_library import DEVICES, written_to
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, keep_programs
 from jaxonomy_dae.compile.model.consistent_point import initial_point
+from jaxonomy_dae.compile.model.tables import Declared
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.host import kept
 from jaxonomy_dae.library import electrical, thermal
@@ -149,9 +150,10 @@ def test_what_enters_by_a_stream_is_not_what_leaves(library):
 
     diagram.add(pipe, offer := Offer(ev, "offer"))
     diagram.connect(pipe.a, offer.a)
-    plan = AcausalCompiler(ev, diagram)().plan
-    quantity, factor = plan.resolve(["pipe.a.m_flow", "pipe.a.h_outflow"])
-    found = initial_point(plan.model, plan.flat.declares).values[quantity] * factor
+    system = AcausalCompiler(ev, diagram)()
+    quantity, factor = system.plan.resolve(["pipe.a.m_flow", "pipe.a.h_outflow"])
+    point = initial_point(system.plan.model, Declared(np.asarray(system.parameters.values), {}))
+    found = point.values[quantity] * factor
     np.testing.assert_allclose(found, [2.0, 7.0], rtol=1e-12)
 
 
