@@ -143,7 +143,8 @@ def _correlations(fit: "Estimate", left: Leftover, judge: Judge) -> list[Descrip
     for j in left.by_output:
         series = [one for one in left.series if one.output == j]
         one, two = (_correlation(judge.residual, series, lag) for lag in (1, 2))
-        unsure = 1 / np.sqrt(sum(len(part.at) for part in series))  # the standard error of a correlation
+        # The standard error of what lag two has beyond the square of lag one (Bartlett 1946).
+        unsure = (1 - one**2) / np.sqrt(sum(len(part.at) for part in series))
         if abs(two - one**2) < 0.5 * abs(one) * (1 - one) + unsure:
             name = fit.objective.stacked.outputs[j]
             own = sum(float(np.sum(judge.residual[one.at] ** 2)) for one in series)

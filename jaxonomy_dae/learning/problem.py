@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
@@ -122,9 +123,10 @@ class Problem:
         mesh: Mesh | None = None,
         **options: Any,
     ):
+        known = list(dict.fromkeys([*keywords_of(Problem.__init__), *OPTIONS]))
         for name in options:
             if name not in OPTIONS:
-                raise ModelError(wrong_keyword("Problem", name, [*keywords_of(Problem.__init__), *OPTIONS], ELSEWHERE))
+                raise ModelError(wrong_keyword("Problem", name, known, ELSEWHERE))
         if not isinstance(system, AcausalSystem):
             raise ModelError(f"Problem needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
         self.system = system
@@ -211,6 +213,7 @@ class Problem:
 
     # --- residuals ---------------------------------------------------------------------------------------------
 
+    @explained_keywords()
     def residuals(
         self,
         model: AcausalSystem | None = None,
@@ -384,6 +387,7 @@ class Problem:
         here = dataclasses.replace(here, watch=None, clock=None)
         return Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
 
+    @explained_keywords()
     def train(
         self,
         how: GradientSteps,
@@ -490,15 +494,18 @@ class Problem:
         other.system = system
         return other
 
-    def with_law(self, name: str, law: Any, stacked: Stacked) -> "Problem":
-        """A copy with another law in place of a network, without a prior."""
+    def with_law(self, name: str, law: Any, stacked: Stacked, penalty: str | None = None) -> "Problem":
+        """A copy with another law in place of a network, of this prior."""
+        dtype = self.system.parameters.values.dtype
+        law = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, law)
         other = copy.copy(self)
         other.system = eqx.tree_at(lambda s: s.neural, self.system, self.system.neural | {name: law})
-        other._stacked, other.penalties = stacked, self.penalties | {name: None}
+        other._stacked, other.penalties = stacked, self.penalties | {name: penalty}
         return other
 
     # --- before a fit ------------------------------------------------------------------------------------------
 
+    @explained_keywords()
     def identifiability(
         self, *, freeze: Mapping[str, float] | Iterable[str] = (), start: Any = None
     ) -> Identifiability:

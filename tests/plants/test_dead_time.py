@@ -101,3 +101,19 @@ def test_dead_times_that_cannot_be():
             posed("held", np.zeros(60), delay)
     with pytest.raises(ModelError, match=r"delay= goes with runs, not with method=Shooting"):
         posed("held", np.zeros(60), {"c.u": 0.1}, method=learning.Shooting())
+
+
+def test_keywords_that_others_hand_on_are_checked_where_they_are_written():
+    """`cross_validate` spoke for `Problem.fit`, and of names that it gives itself."""
+    problem = posed("held", np.zeros(60), {"c.u": 0.1})
+    for call, text in [
+        (
+            lambda: learning.cross_validate(problem, fold=2),
+            "cross_validate: there is no argument 'fold': did you mean 'folds'",
+        ),
+        (lambda: learning.ensemble(problem, step=2), "ensemble: there is no argument 'step': did you mean 'steps'"),
+        (lambda: problem.residuals(delays={}), "residuals: there is no argument 'delays': did you mean 'delay'"),
+        (lambda: posed("held", np.zeros(60), {}, max_step=1), "did you mean 'max_steps' or 'max_events'"),
+    ]:
+        with pytest.raises(ModelError, match=text):
+            call()

@@ -17,7 +17,7 @@ from ...base.errors import InitializationError, ModelError, SimulationError, exp
 from ...host.cache import PROGRAMS
 from ...host.members import batch_size, is_batched, say_of_members
 from ...host.rows import filled_up
-from ...host.staging import as_argument, as_array, is_forwards, is_staged, is_traced, picked
+from ...host.staging import as_argument, as_array, is_forwards, is_staged, is_traced, on_device, picked
 from ...solve.adjoint.stored_adjoint import default_adjoint
 from ...solve.methods import BDF, Rodas5P, Tsit5
 from ...solve.methods.causes import decay_at, is_stiff
@@ -233,7 +233,7 @@ def _given(system: AcausalSystem, t0: Time, t1: Time, ts: Times, inputs: Args, i
     if initial is None or isinstance(initial, Mapping):
         initial = {name: as_argument(v, dtype) for name, v in sorted((initial or {}).items())}
     else:
-        initial = jax.tree.map(lambda part: as_argument(part, dtype), initial)
+        initial = jax.tree.map(lambda part: on_device(part, dtype), initial)
     t0, t1 = as_argument(t0, dtype), as_argument(t1, dtype)
     if ts is not None:
         ts = as_argument(ts, dtype)
@@ -343,7 +343,7 @@ class _Call:
                 say_of_members(number, texts, "runs that stopped", hint, self.throw, stacklevel=5)
                 checked = False
         x = raised(outcome.x, outcome.result, has_events, *self.bounds) if checked else outcome.x
-        return self._solution(outcome, outcome.stats, (outcome.ts, x, outcome.discrete), outcome.memory)
+        return self._solution(outcome, outcome.stats, (jnp.asarray(outcome.ts), x, outcome.discrete), outcome.memory)
 
     def outside(self) -> Solution:
         """The solution where values are known. Runs are repeated with an implicit solver, or with more room for events,

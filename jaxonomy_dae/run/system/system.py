@@ -139,7 +139,9 @@ class AcausalSystem(eqx.Module):
 
     def _at(self, parameters: Parameters) -> "AcausalSystem":
         """The system with these parameters, and the typical sizes that follow from them."""
-        return dataclasses.replace(self, parameters=parameters, typical_sizes=self._sizes_at(parameters))
+        system, sizes = eqx.tree_at(lambda s: s.parameters, self, parameters), self._sizes_at(parameters)
+        # Of one that holds some leaves only, as `partition` makes it, sizes may be None, which `tree_at` does not take.
+        return system if sizes is self.typical_sizes else eqx.tree_at(lambda s: s.typical_sizes, system, sizes)
 
     def _sizes_at(self, parameters: Parameters) -> Float[Array, "*batch quantities"]:
         """Typical sizes at other parameter values; the present ones where these are not known, or a batch."""
