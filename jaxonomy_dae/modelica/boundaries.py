@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from ..write.ports import inflow
 from . import tree
 from .flat_model import FlatModel
 from .front_end import Flattened, FrontEnd, Unbalanced, Unrooted
@@ -49,49 +50,64 @@ def flattened(
 
     - `ModelError` as `FrontEnd.flatten`.
     """
-    before, trees = f"{source or ''}\n", list[str]()
-    modified = f"{name}({changes})" if changes else name
+    before = f"{source or ''}\n"
+    modified = f"{_INSIDE}({changes})" if changes else _INSIDE
+    alone, trees = _alone(front_end, name, changes, source, frames)
+    streams = list(_with_streams(alone.flat))
+    if not trees and not streams:
+        return Closed(alone, graph=_edges(alone.flat), roots=tuple(alone.flat["definite_roots"]))
+    variables = alone.flat["variables"]
+    declared, equations, renamed = [f"{name} {modified};"], [], {}
+    if "world.enableAnimation" in variables:
+        declared.append("inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false);")
+    for k, top in enumerate(streams):
+        declared += _rim(k, top, variables)
+        equations.append(f"connect({_INSIDE}.{top}, {_RIM}{k}.port);")
+        for n, v in variables.items():
+            if n.startswith(f"{top}.") and v["stream"]:
+                stream = n[len(top) + 1 :]
+                renamed[f"{_RIM}{k}.port.{stream}"] = f"{top}.{inflow(stream)}"
+    for k, (n, kind) in enumerate(_inputs(alone.dae)):
+        declared.append(f"input {kind} {_RIM}u{k}{_size(n, variables)};")
+        equations.append(f"{_INSIDE}.{n} = {_RIM}u{k};")
+    roots = _roots(trees, f"{_INSIDE}.")
+    text = f"{before}{_model([*declared, *roots[0]], [*roots[1], *equations])}"
+    return _as_alone(front_end.flatten(text, MODEL), alone, renamed)
+
+
+def _alone(
+    front_end: FrontEnd, name: str, changes: str, source: str | None, frames: Sequence[str]
+) -> tuple[Flattened, list[str]]:
+    """The class by itself, and the overdetermined records that need a root outside."""
+    extended = f"extends {name}({changes});" if changes else f"extends {name};"
+    trees: list[str] = []
     while True:
         try:
-            if not changes and not trees:
-                alone = front_end.flatten(source, name)
+            if changes or trees:
+                declared, equations = _roots(trees, "")
+                found = front_end.flatten(f"{source or ''}\n{_model([extended, *declared], equations)}", MODEL)
             else:
-                body = _rooted(trees, "") if trees else ""
-                alone = front_end.flatten(f"{before}model {MODEL} extends {modified}; {body} end {MODEL};\n", MODEL)
+                found = front_end.flatten(source, name)
         except Unrooted as error:
             if not error.record.endswith(_ORIENTATION) or error.record in trees:
                 raise
             trees.append(error.record)
             continue
         except Unbalanced as error:
-            alone_too = [f"{n}{_ORIENTATION}" for n in frames if f"{n}{_ORIENTATION}" not in trees]
-            if not alone_too or error.missing != _LACKING * len(alone_too):
+            loose = [f"{n}{_ORIENTATION}" for n in frames if f"{n}{_ORIENTATION}" not in trees]
+            if not loose or error.missing != _LACKING * len(loose):
                 raise
-            trees += alone_too
+            trees += loose
             continue
-        wanting = [r for r in _believed(alone.flat) if r.endswith(_ORIENTATION) and r not in trees]
+        wanting = [r for r in _believed(found.flat) if r.endswith(_ORIENTATION) and r not in trees]
         if not wanting:
-            break
+            return found, trees
         trees += wanting
-    streams = list(_with_streams(alone.flat))
-    if not trees and not streams:
-        return Closed(alone, graph=_edges(alone.flat), roots=tuple(alone.flat["definite_roots"]))
-    variables = alone.flat["variables"]
-    lines = [f"{modified[: len(name)]} {_INSIDE}{modified[len(name) :]};"]
-    if "world.enableAnimation" in variables:
-        lines.append("inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false);")
-    equations, renamed = [], {}
-    for k, top in enumerate(streams):
-        lines += _rim(k, top, variables)
-        equations.append(f"connect({_INSIDE}.{top}, {_RIM}{k}.port);")
-        renamed |= {f"{_RIM}{k}.port.{n}": f"{top}.in_stream({n})" for n in _members(top, variables, "stream")}
-    for k, (n, kind) in enumerate(_inputs(alone.dae)):
-        lines.append(f"input {kind} {_RIM}u{k}{_size(n, variables)};")
-        equations.append(f"{_INSIDE}.{n} = {_RIM}u{k};")
-    rooted = _rooted(trees, f"{_INSIDE}.")
-    lines_and_equations = " ".join(lines) + (rooted or " equation ") + " ".join(equations)
-    found = front_end.flatten(f"{before}model {MODEL} {lines_and_equations} end {MODEL};\n", MODEL)
-    return _as_alone(found, alone, renamed)
+
+
+def _model(declared: Sequence[str], equations: Sequence[str]) -> str:
+    body = f" equation {' '.join(equations)}" if equations else ""
+    return f"model {MODEL} {' '.join(declared)}{body} end {MODEL};\n"
 
 
 def _believed(flat: Json) -> Iterator[str]:
@@ -105,28 +121,22 @@ def _believed(flat: Json) -> Iterator[str]:
             yield record
 
 
-def _rooted(trees: Sequence[str], inside: str) -> str:
+def _roots(trees: Sequence[str], inside: str) -> tuple[list[str], list[str]]:
     """Boundaries that are roots of trees, and equations that begin with them."""
-    declared = " ".join(f"{_FRAME} {_RIM}r{k};" for k in range(len(trees)))
-    out = []
+    declared, equations = [], []
     for k, record in enumerate(trees):
         rim, of = f"{_RIM}r{k}", f"{inside}{record}"
-        out.append(f"Connections.root({rim}.R); Connections.branch({rim}.R, {of}); {rim}.r_0 = zeros(3);")
-        out.append(f"{rim}.R = Modelica.Mechanics.MultiBody.Frames.nullRotation(); {_IN_PLACE.format(of, rim)}")
-    return f"{declared} equation {' '.join(out)} " if trees else ""
+        declared.append(f"{_FRAME} {rim};")
+        equations.append(f"Connections.root({rim}.R); Connections.branch({rim}.R, {of}); {rim}.r_0 = zeros(3);")
+        equations.append(f"{rim}.R = Modelica.Mechanics.MultiBody.Frames.nullRotation(); {_IN_PLACE.format(of, rim)}")
+    return declared, equations
 
 
 def _with_streams(flat: Json) -> Iterator[str]:
     """The innermost connectors of the class that have streams."""
-    tops = tuple(flat["top_level_connectors"])
+    tops = {n.partition("[")[0] for n in flat["top_level_connectors"]}
     found = [n.rpartition(".")[0] for n, v in flat["variables"].items() if v["stream"]]
-    for n in dict.fromkeys(found):
-        if n.startswith(tops) and re.match(r"[^.\[]*", n)[0] in {re.match(r"[^.\[]*", t)[0] for t in tops}:  # type: ignore
-            yield n
-
-
-def _members(top: str, variables: Mapping[str, Json], prefix: str) -> list[str]:
-    return [n[len(top) + 1 :] for n, v in variables.items() if n.startswith(f"{top}.") and v[prefix]]
+    yield from (n for n in dict.fromkeys(found) if re.split(r"[.\[]", n)[0] in tops)
 
 
 def _rim(k: int, top: str, variables: Mapping[str, Json]) -> Iterator[str]:

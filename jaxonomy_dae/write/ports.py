@@ -74,7 +74,8 @@ class Domain:
 
 def inflow(stream: str) -> str:
     """The name of what a stream would bring into the component; the port comes first, as in `a.in_stream(h)`."""
-    return f"in_stream({stream})"
+    name, bracket, place = stream.partition("[")
+    return f"in_stream({name}){bracket}{place}"
 
 
 Electrical = Domain("Electrical", across=(("v", "V"),), through=(("i", "A"),))
