@@ -103,6 +103,14 @@ def private(name: str) -> Any:
         raise MissingName(f"{_versions(path)} has no {path}") from error
 
 
+@functools.lru_cache(maxsize=64)  # asked at each run outside of jit
+def _names_in(found: Any) -> frozenset[str]:
+    """The names of a dataclass's fields, or of a function's arguments."""
+    if dataclasses.is_dataclass(found):
+        return frozenset(field.name for field in dataclasses.fields(found))
+    return frozenset(inspect.signature(found).parameters)
+
+
 def missing(names: tuple[str, ...]) -> str | None:
     """The first of the names that the installed versions lack or define otherwise, in words; None if all fit. The
     argument names of `AbstractAdjoint.loop` are checked, too."""
@@ -115,13 +123,10 @@ def missing(names: tuple[str, ...]) -> str | None:
         wanted = SHAPES.get(name)
         if wanted is None:
             continue
-        if dataclasses.is_dataclass(found):
-            lacking = wanted - {field.name for field in dataclasses.fields(found)}
-        else:
-            lacking = wanted ^ set(inspect.signature(found).parameters)
+        lacking = wanted - _names_in(found) if dataclasses.is_dataclass(found) else wanted ^ _names_in(found)
         if lacking:
             return f"{_versions(path)} has another {path}: {', '.join(sorted(lacking))}"
-    given = set(inspect.signature(diffrax.AbstractAdjoint.loop).parameters) - {"self"}
+    given = _names_in(diffrax.AbstractAdjoint.loop) - {"self"}
     if given != _ADJOINT_LOOP:
         other = ", ".join(sorted(given ^ _ADJOINT_LOOP))
         return f"{_versions('diffrax')} calls AbstractAdjoint.loop with other arguments: {other}"

@@ -22,6 +22,7 @@ from typing import Any, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..base.aliases import PyTree
@@ -70,10 +71,18 @@ def _flat(call: Call) -> Traceable:
 
 def _call_of(function: Callable, args: tuple[PyTree, ...], kwargs: dict[str, PyTree]) -> tuple[Call, list[Array]]:
     leaves, structure = jax.tree.flatten((args, kwargs))
-    # Those of NumPy, such as weights of a user's, lie nowhere yet.
-    arrays = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+    arrays = [_array(leaf) for leaf in leaves if eqx.is_array(leaf)]
     static = tuple(Place.ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
     return Call(function, structure, static, tuple(jax.typeof(a) for a in arrays), _surroundings(arrays)), arrays
+
+
+def _array(leaf: Any) -> Any:
+    """An array that a program takes: JAX' own, or one of NumPy, which lies nowhere yet, of a type that JAX has."""
+    if isinstance(leaf, jax.Array):
+        return leaf
+    fits = isinstance(leaf, np.ndarray) and jax.dtypes.canonicalize_dtype(leaf.dtype) == leaf.dtype
+    config: Any = jax.config
+    return leaf if fits and config.jax_default_device is None else jnp.asarray(leaf)
 
 
 def options() -> list[tuple[str, object]]:
@@ -97,8 +106,10 @@ def _of_options() -> str:
 
 def _surroundings(arrays: list[Array]) -> Hashable:
     """What else decides about a program: where its arrays lie, and JAX's options."""
-    where = frozenset(d for a in arrays if not is_traced(a) for d in a.devices())
-    return where, _of_options()
+    known = [a for a in arrays if not is_traced(a)]
+    there = {d for a in known if isinstance(a, jax.Array) for d in a.devices()}
+    # Arrays of NumPy go where the others lie, and else to the first device.
+    return frozenset(there or (jax.local_devices()[:1] if known else ())), _of_options()
 
 
 def _identity(digest: str) -> str | None:

@@ -39,6 +39,12 @@ def on_device(value: Numeric, dtype: DTypeLike | None = None) -> Numeric:
     return jnp.asarray(value, dtype) if is_traced(value) else jax.device_put(np.array(value, dtype))
 
 
+def as_argument(value: Numeric, dtype: DTypeLike | None = None) -> Numeric:
+    """A number, or an array, of this type for a program: a copy in NumPy where values are known. A program takes it in
+    1 µs; to make JAX' array of it before, as `on_device` does, takes 19 (jax 0.10.2)."""
+    return jnp.asarray(value, dtype) if is_traced(value) else np.array(value, dtype)
+
+
 def picked(array: Numeric, place: Numeric) -> Numeric:
     """`array[place]`, by NumPy where values are known, so that nothing is compiled."""
     return array[place] if is_traced(array) else jax.device_put(np.array(np.asarray(array)[place]))

@@ -47,20 +47,20 @@ class Function:
         self.pulls = False  # a part of a derivative in reverse mode: what is derived from it has no identity
 
     def __call__(self, function: Traceable, arrays: list[Any]) -> PyTree:
-        arrays = [a if isinstance(a, jax.Array) else jax.device_put(a) for a in arrays]  # JAX' own kind of float
         work = _at_work(arrays)
+        if not work and _is_plain(arrays):
+            if self._program is None:
+                placed = list(map(_placed, arrays))
+                self._program = Program(function, placed, self.name, self.why, self.optimize, self.identity)
+            if self._program.stands_alone:
+                return self._program(arrays, function)
+        arrays = list(map(_placed, arrays))
         if work == "LinearizeTracer":
             return self._differentiated(function, arrays)
         if work == "JVPTracer":
             return self._pushed(function, arrays)
         if work == "BatchTracer":
             return self._batched(function, arrays)
-        if work or not _is_plain(arrays):
-            return self._by_jax(function, arrays)
-        if self._program is None:
-            self._program = Program(function, arrays, self.name, self.why, self.optimize, self.identity)
-        if self._program.stands_alone:
-            return self._program(arrays, function)
         return self._by_jax(function, arrays)
 
     @property
@@ -345,12 +345,17 @@ def _at_work(arrays: list[Array]) -> str:
     return "other"
 
 
+def _placed(array: Any) -> Any:
+    """An array of JAX, of its own kind of float."""
+    return array if isinstance(array, jax.Array) else jax.device_put(array)
+
+
 def _is_plain(arrays: list[Array]) -> bool:
     """True if a program may be called as it is: arrays lie on one device, and nothing asks JAX for more checks."""
     config: Any = jax.config
     if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs or config.jax_check_tracer_leaks:
         return False
-    if len({d for a in arrays for d in a.devices()}) > 1:
+    if len({d for a in arrays if isinstance(a, jax.Array) for d in a.devices()}) > 1:
         return False
     # Inside another program, what is computed becomes a part of it, also where no argument is traced.
     return not is_staged(jax.device_put(_SOMETHING))

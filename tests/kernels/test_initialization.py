@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import planar_models
 import pytest
 from problems import RELEASE, compiled
 from sympy import Eq
@@ -334,3 +335,16 @@ def test_the_size_of_variables_that_are_equal():
     one, other = (compiled(Equal(EqnEnv(), "c", order)) for order in ("xy", "yx"))
     np.testing.assert_array_equal(one.typical_sizes, other.typical_sizes)
     assert float(np.max(one.typical_sizes)) == 1.0
+
+
+def test_a_start_that_is_met_to_rounding_moves_as_a_whole():
+    """The search began at angles and positions that held to 1e-16, and took that for the size of what it moved: the
+    gradient moved one link's middle by half, and turned the other."""
+    pendulum = planar_models.double_pendulum("auto")
+
+    def start(x):
+        return pendulum.with_parameters({"world.x": x}).initialize()
+
+    moved = jax.jvp(start, (0.0,), (1.0,))[1]
+    expected = [float(name in ("j2.frame_a.x", "a.body.x", "b.body.x")) for name in pendulum.states]
+    np.testing.assert_allclose(moved, expected, atol=1e-12)

@@ -12,7 +12,16 @@ import scipy.integrate
 import scipy.optimize
 from device_library import standard_library
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae import (
+    AcausalCompiler,
+    AcausalDiagram,
+    Component,
+    Eq,
+    EqnEnv,
+    actual_stream,
+    der,
+    simulate,
+)
 from jaxonomy_dae.library import electrical, rotational, thermal, translational
 from jaxonomy_dae.library.signal import Constant
 from jaxonomy_dae.modelica import Library
@@ -238,3 +247,108 @@ def test_an_arm_of_three_dimensional_parts_on_our_damper(library):
     by_d = (phi(1.5, 0.3 + h) - phi(1.5, 0.3 - h))[-1] / (2 * h)
     assert slopes["arm.body.m"] == pytest.approx(by_m, rel=1e-4)
     assert slopes["damper.d"] == pytest.approx(by_d, rel=1e-4)
+
+
+BODIES = "Mechanics.MultiBody"
+
+
+def test_a_double_pendulum_of_bodies_and_our_damper(library):
+    """World, joints and bodies are components of their own; our damper acts between the links. The equations of
+    Lagrange in the angles of both links, by SciPy; slopes by differences."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    world = library.component(f"Modelica.{BODIES}.World", enableAnimation=False)(ev, "world")
+    first = opened(library, f"{BODIES}.Joints.Revolute")(ev, "first", start={"phi": 0.3, "w": 0.0})
+    Driven = library.component(f"Modelica.{BODIES}.Joints.Revolute", useAxisFlange=True)
+    second = Driven(ev, "second", start={"phi": 0.5, "w": 0.0})
+    link = opened(library, f"{BODIES}.Parts.FixedTranslation")(ev, "link", r=[0.7, 0.0, 0.0])
+    Body = opened(library, f"{BODIES}.Parts.Body")
+    upper = Body(ev, "upper", m=1.2, r_CM=[0.3, 0.0, 0.0], I_33=0.05)
+    lower = Body(ev, "lower", m=0.8, r_CM=[0.4, 0.0, 0.0], I_33=0.02)
+    damper, wall = rotational.Damper(ev, "damper", d=0.3), rotational.FixedAngle(ev, "wall")
+    d.add(world, first, second, link, upper, lower, damper, wall)
+    d.connect(world.frame_b, first.frame_a)
+    d.connect(first.frame_b, link.frame_a, upper.frame_a)
+    d.connect(link.frame_b, second.frame_a)
+    d.connect(second.frame_b, lower.frame_a)
+    d.connect(second.axis, damper.flange_a)
+    d.connect(damper.flange_b, wall.flange)
+    system = AcausalCompiler(ev, d)()
+    values = {"upper.m": 1.2, "lower.m": 0.8, "link.r[1]": 0.7, "lower.I_33": 0.02, "damper.d": 0.3}
+    ts = np.array([0.4, 0.8, 1.2])
+    found, slopes = run_with_slopes(system, values, ts, ["first.phi", "second.phi"], ["first.phi", "second.phi"])
+
+    def swing(m1, m2, length, inertia, damping):
+        g, turned = 9.80665, 0.3 + np.array([0.0, 0.5])
+        a, b, c = 0.05 + m1 * 0.09 + m2 * length**2, m2 * length * 0.4, inertia + m2 * 0.16
+
+        def slope(t, x):
+            (one, two), (v, w) = x[:2], x[2:]
+            sin, cos, torque = np.sin(two - one), np.cos(two - one), damping * (w - v)
+            right = [
+                torque + b * sin * w**2 - (m1 * 0.3 + m2 * length) * g * np.cos(one),
+                -torque - b * sin * v**2 - m2 * 0.4 * g * np.cos(two),
+            ]
+            return [v, w, *np.linalg.solve([[a, b * cos], [b * cos, c]], right)]
+
+        run = scipy.integrate.solve_ivp(slope, (0.0, 1.2), [*turned, 0.0, 0.0], t_eval=ts, rtol=1e-11, atol=1e-12)
+        return np.array([run.y[0], run.y[1] - run.y[0]])
+
+    np.testing.assert_allclose([found["first.phi"], found["second.phi"]], swing(*values.values()), atol=1e-6)
+    for name, value in values.items():
+        up, down = (swing(*(values | {name: value + s * 1e-5}).values())[:, -1].sum() for s in (1, -1))
+        assert slopes[name] == pytest.approx((up - down) / 2e-5, rel=1e-4), name
+
+
+WATER = "redeclare package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater"
+
+
+class Tank(Component):
+    """A mass M of water of the specific enthalpy h under the pressure p + k M, with a port of the library's domain."""
+
+    def __init__(self, ev, name, port, M, h, k):
+        super().__init__(ev, name)
+        a = self.port("a", port.domain)
+        k, start, begin = self.parameter("k", k), self.parameter("h0", h), self.parameter("M0", M)
+        mass, h = self.variable("M", start=begin, fixed=True), self.variable("h", start=start, fixed=True)
+        self.add_equations(Eq(a.p, 1e5 + k * mass), Eq(a.h_outflow, h), Eq(der(mass), a.m_flow))
+        self.add_equations(Eq(mass * der(h), a.m_flow * (actual_stream(a, "h_outflow") - h)))
+
+
+def test_tanks_of_ours_behind_valves_of_the_library(library):
+    """Three tanks of water meet at a junction behind linear valves, m = dp m_nominal/dp_nominal. The flow out of one of
+    them turns. Masses and enthalpies by SciPy, with the mixture of what flows into the junction."""
+    Valve = library.component("Modelica.Fluid.Valves.ValveLinear", WATER)
+    ev, d = EqnEnv(), AcausalDiagram()
+    opening = Constant(ev, "opening", 0.5)
+    valves = [Valve(ev, f"v{k}", dp_nominal=1e4, m_flow_nominal=n) for k, n in enumerate([2.0, 1.0, 3.0])]
+    given = [(30.0, 1e5, 700.0), (10.0, 3e5, 1500.0), (12.0, 2e5, 400.0)]
+    tanks = [Tank(ev, f"t{k}", valves[0].port_a, *each) for k, each in enumerate(given)]
+    d.add(opening, *valves, *tanks)
+    for valve, tank in zip(valves, tanks, strict=True):
+        d.connect(tank.a, valve.port_a)
+        d.connect(opening.y, valve.opening)
+    d.connect(*(valve.port_b for valve in valves))
+    system = AcausalCompiler(ev, d)()
+    values = {"t0.M0": 30.0, "t1.h0": 3e5, "t2.k": 400.0, "v1.m_flow_nominal": 1.0}
+    ts = np.array([2.0, 10.0, 30.0])
+    names = [f"t{k}.{n}" for n in "Mh" for k in range(3)]
+    found, slopes = run_with_slopes(system, values, ts, names, names)
+
+    def reference(M0, h1, k2, nominal):
+        M, h, k = np.array([M0, 10.0, 12.0]), np.array([1e5, h1, 2e5]), np.array([700.0, 1500.0, k2])
+        G = 0.5 * np.array([2.0, nominal, 3.0]) / 1e4
+
+        def slope(t, x):
+            m = G * (k * x[:3] @ G / G.sum() - k * x[:3])  # into the tanks
+            leaving = np.maximum(-m, 0.0)
+            mixed = leaving @ x[3:] / max(leaving.sum(), 1e-300)
+            return [*m, *(np.maximum(m, 0.0) * (mixed - x[3:]) / x[:3])]
+
+        run = scipy.integrate.solve_ivp(slope, (0.0, 30.0), [*M, *h], t_eval=ts, rtol=1e-11, atol=1e-9, max_step=0.05)
+        return run.y
+
+    expected = reference(*values.values())
+    np.testing.assert_allclose([found[n] for n in names], expected, rtol=1e-6)
+    for name, value in values.items():
+        up, down = (reference(*(values | {name: value * (1 + s * 1e-4)}).values())[:, -1].sum() for s in (1, -1))
+        assert slopes[name] == pytest.approx((up - down) / (2e-4 * value), rel=1e-4), name

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ...solve.linear.graph_elimination import GraphElimination, with_small_indices
 from .group import Point, QuantityGroup
@@ -60,6 +60,7 @@ def natural_sizes(
     by_terms: bool = False,
     rates: tuple[np.ndarray, np.ndarray] | None = None,
     factors: "Factors | None" = None,
+    given: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]:
     """Sizes s with |∂F_e/∂x_q|·s_q near 1 in units of each equation, in the least-squares sense of logarithms (Curtis &
     Reid 1972, where the entries depend on the sizes as well). What an equation has without quantities, such as the
@@ -74,18 +75,20 @@ def natural_sizes(
     - `by_terms`: terms count as well as entries, which do not see that one of their terms is lost beside others; and
         sizes move only for what it gains.
     - `factors`: of an earlier search in the same equations, to be used again where they are the same.
+    - `given`: as `constants` returns it, if that is known.
     """
     factors = Factors() if factors is None else factors
     n, n_parameters = len(size), len(parameters)
     known = np.concatenate([size != 0.0, parameters != 0.0, np.zeros(n_equations, bool)])
     quantity, parameter = (np.where(given == 0.0, 1.0, given) for given in (size, parameters))
     begun = np.log10(np.abs(np.append(quantity, parameter)))
-    constants, time = _constants(groups, parameters), 0.0
+    there, where = constants(groups, parameters) if given is None else given
+    beside, time = _Seen(np.log10(there), where, _joined([]), _joined([]), 0), 0.0
     for _ in range(ROUNDS):
         entries = _seen(groups, quantity, parameter, False)
         if not len(entries.logarithm):
             break
-        seen = [entries, constants] + ([_seen(groups, quantity, parameter, True)] if by_terms else [])
+        seen = [entries, beside] + ([_seen(groups, quantity, parameter, True)] if by_terms else [])
         matrix: Any = sp.vstack([s.powers(n, n_parameters, n_equations) for s in seen], format="csr")
         matrix.data[known[matrix.indices]] = 0.0
         off = np.concatenate([s.logarithm for s in seen])
@@ -159,8 +162,11 @@ def _moved(size: np.ndarray, decades: np.ndarray) -> np.ndarray:
     return np.where(decades == 0.0, size, np.sign(size) * 10.0**limited)
 
 
-def _constants(groups: Sequence[QuantityGroup], parameters: np.ndarray) -> _Seen:
-    """|F_e| where all quantities are zero; none that reads a parameter without a value."""
+def constants(
+    groups: Sequence[QuantityGroup], parameters: Float[np.ndarray, " p"]
+) -> tuple[Float[np.ndarray, " c"], Int[np.ndarray, " c"]]:
+    """|F_e| where all quantities are zero, where it is not zero, and the equations e; none that reads a parameter
+    without a value."""
     values, equations = [np.zeros(0)], [np.zeros(0, np.int64)]
     quantities = 1 + max((int(g.quantity.max(initial=-1)) for g in groups), default=0)
     nothing = Point.of(np.zeros(quantities), parameters, 0.5)
@@ -169,10 +175,9 @@ def _constants(groups: Sequence[QuantityGroup], parameters: np.ndarray) -> _Seen
             continue
         there = np.abs(group.residual(nothing))
         used = (there > 0) & np.isfinite(there) & (parameters[group.parameter] != 0.0).all(axis=1)
-        values.append(np.log10(there[used]))
+        values.append(there[used])
         equations.append(group.equation[used])
-    none = _joined([])
-    return _Seen(np.concatenate(values), np.concatenate(equations), none, none, 0)
+    return np.concatenate(values), np.concatenate(equations)
 
 
 def _seen(groups: Sequence[QuantityGroup], quantity: np.ndarray, parameter: np.ndarray, of_terms: bool) -> _Seen:

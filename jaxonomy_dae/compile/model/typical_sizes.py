@@ -1,6 +1,7 @@
 """Sizes of quantities of which nothing is declared, by what their equations say."""
 
 import weakref
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +11,7 @@ from ...graph.structure.integers import distinct
 from .declared import declared_scale
 from .extended import Extended
 from .jacobian import generic
-from .natural_sizes import Factors, natural_sizes
+from .natural_sizes import Factors, constants, natural_sizes
 from .quantities import ReducedModel
 
 MOVED = 1e-6  # of parameters: a difference from which a slope is told to six digits
@@ -22,8 +23,13 @@ def typical_sizes(
     model: ReducedModel, parameters: Float[np.ndarray, " parameters"]
 ) -> Float[np.ndarray, " quantities"]:
     """The typical sizes of all quantities, at these values of the parameters; powers of two, by which numbers are
-    multiplied without rounding."""
-    return 2.0 ** np.round(np.log2(unrounded_sizes(model, parameters)))
+    multiplied without rounding.
+
+    What they follow from is rounded to powers of two as well: so values of parameters near each other, as those of a
+    fit or of a slider, have the same sizes, which are looked up then (0.1 ms in place of 3 for a pendulum).
+    """
+    started = _powers_of_two(_declared_or_started(model, parameters))
+    return _powers_of_two(_balanced(model.extended, _between(model, parameters), started, _powers_of_two))
 
 
 def unrounded_sizes(
@@ -31,11 +37,22 @@ def unrounded_sizes(
 ) -> Float[np.ndarray, " quantities"]:
     """As `typical_sizes` before rounding to powers of two. State selection compares sizes, and rounding could turn a
     small difference into a factor of two."""
-    # What events assign starts at one of its values, where a branch of an equation may be zero that has a size in all
-    # others: free friction says nothing of the force that friction has.
+    started = _declared_or_started(model, parameters)
+    return _balanced(model.extended, _between(model, parameters), started, np.asarray)
+
+
+def _between(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
+    """What events assign starts at one of its values, where a branch of an equation may be zero that has a size in all
+    others: free friction says nothing of the force that friction has. Beside it, other branches count."""
     assigned = model.flat.parameters.changed_by_events
-    parameters = np.where(assigned[: len(parameters)], parameters * (1 + MOVED), parameters)
-    return _balanced(model.extended, parameters, _declared_or_started(model, parameters))
+    return np.where(assigned[: len(parameters)], parameters * (1 + MOVED), parameters)
+
+
+def _powers_of_two(values: np.ndarray) -> np.ndarray:
+    """The nearest powers of two, with the signs of the values; zero stays zero."""
+    with np.errstate(divide="ignore"):
+        exponents = np.round(np.log2(np.abs(values)))
+    return np.sign(values) * np.exp2(exponents)
 
 
 def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
@@ -75,20 +92,33 @@ class _Balance:
         q = extended.quantities
         lower = np.flatnonzero((q.owner[:-1] == q.owner[1:]) & (q.order[1:] == q.order[:-1] + 1))
         self.rates = (lower, lower + 1) if len(lower) else None
-        self.found: dict[tuple[bytes, bytes], np.ndarray] = {}
+        # Groups in which something stands beside the quantities, at some values of the parameters.
+        anywhere = generic(np.random.default_rng(1), (int(self.read.max(initial=-1)) + 1,))
+        self.with_constants = [g for g in extended.groups if len(constants([g], anywhere)[0])]
+        self.found: dict[tuple[bytes, ...], np.ndarray] = {}
 
 
 _BALANCES: weakref.WeakKeyDictionary[Extended, _Balance] = weakref.WeakKeyDictionary()
 
 
-def _balanced(extended: Extended, parameters: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Sizes that make terms alike, where `size` is zero."""
-    balance = _BALANCES.setdefault(extended, _Balance(extended))
-    key = size.tobytes(), parameters[balance.read].tobytes()
+def _balanced(
+    extended: Extended, parameters: np.ndarray, size: np.ndarray, rounded: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Sizes that make terms alike, where `size` is zero; of numbers that are `rounded` first."""
+    balance = _BALANCES.get(extended)
+    if balance is None:
+        balance = _BALANCES[extended] = _Balance(extended)
+    # What stands beside quantities may be a difference of parameters: it is rounded, not they.
+    there, where = constants(balance.with_constants, parameters)
+    there, parameters = rounded(there), rounded(parameters[balance.read])
+    key = size.tobytes(), parameters.tobytes(), there.tobytes(), where.tobytes()
     if key not in balance.found:
+        every = np.zeros(int(balance.read.max(initial=-1)) + 1)
+        every[balance.read] = parameters
         sizes, _ = natural_sizes(
-            extended.groups, extended.n_equations, size, parameters, rates=balance.rates, factors=balance.factors
-        )
+            extended.groups, extended.n_equations, size, every,
+            rates=balance.rates, factors=balance.factors, given=(there, where),
+        )  # fmt: skip
         while len(balance.found) >= ROOM:
             balance.found.pop(next(iter(balance.found)), None)
         balance.found[key] = 10.0 ** np.clip(np.log10(np.abs(sizes)), -DECADES, DECADES)

@@ -1,6 +1,7 @@
 """`simulate`: a compiled system integrated by Diffrax."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ from ...base.errors import InitializationError, ModelError, SimulationError, exp
 from ...host.cache import PROGRAMS
 from ...host.members import batch_size, is_batched, say_of_members
 from ...host.rows import filled_up
-from ...host.staging import as_array, is_forwards, is_staged, is_traced, on_device, picked
+from ...host.staging import as_argument, as_array, is_forwards, is_staged, is_traced, on_device, picked
 from ...solve.adjoint.stored_adjoint import default_adjoint
 from ...solve.methods import BDF, Rodas5P, Tsit5
 from ...solve.methods.causes import decay_at, is_stiff
@@ -180,8 +181,8 @@ def simulate(
         check_tolerances(rtol, atol, dtype)
     elif control:
         raise ModelError("control= and stepsize_controller= both say what errors count: leave one of them out")
-    rtol, atol = on_device(rtol, dtype), on_device(atol, dtype)
-    dtmax = None if dtmax is None else on_device(dtmax, dtype)
+    rtol, atol = as_argument(rtol, dtype), as_argument(atol, dtype)
+    dtmax = None if dtmax is None else as_argument(dtmax, dtype)
     jump_ts = jump_times(jump_ts, dtype)
     given = _given(system, t0, t1, ts, read, initial)
     begun = None
@@ -192,7 +193,7 @@ def simulate(
             if is_staged(given)
             else search_outside(system, given.t0, given.inputs, given.initial)
         )
-    tolerances = None if prescribed else (rtol, scaled_atol(system, atol))
+    scaled = scaled_atol(system, atol)
     call = _Call(
         system=system,
         given=given,
@@ -201,6 +202,7 @@ def simulate(
         solver=solver,
         rtol=rtol,
         atol=atol,
+        scaled=scaled,
         ends=step_ends(system.plan, read),
         adjoint=adjoint,
         controller=stepsize_controller,
@@ -211,25 +213,33 @@ def simulate(
         known=not is_traced((given, adjoint, stepsize_controller)),
         duration=None if is_traced((t0, t1)) else float(t1) - float(t0),
         asked=Asked(
-            jump_ts, dtmax, max_steps, None if prescribed else solver, tuple(control), tolerances, throw is not False
-        ).comparable(),
+            jump_ts,
+            dtmax,
+            max_steps,
+            None if prescribed else solver,
+            tuple(control),
+            None if prescribed else (rtol, scaled),
+            throw is not False,
+        ).comparable(),  # fmt: skip
     )
-    return call.traced() if is_traced((given, call.options())) else call.outside()
+    return (
+        call.traced() if is_traced((given, adjoint, stepsize_controller, rtol, scaled, call.asked)) else call.outside()
+    )
 
 
 def _given(system: AcausalSystem, t0: Time, t1: Time, ts: Times, inputs: Args, initial: Any) -> Given:
     """What is integrated. Numbers become arrays, so that another value is not another program."""
     dtype = system.parameters.values.dtype
     if initial is None or isinstance(initial, Mapping):
-        initial = {name: on_device(v, dtype) for name, v in sorted((initial or {}).items())}
+        initial = {name: as_argument(v, dtype) for name, v in sorted((initial or {}).items())}
     else:
         initial = jax.tree.map(lambda part: on_device(part, dtype), initial)
-    t0, t1 = on_device(t0, dtype), on_device(t1, dtype)
+    t0, t1 = as_argument(t0, dtype), as_argument(t1, dtype)
     if ts is not None:
-        ts = on_device(ts, dtype)
+        ts = as_argument(ts, dtype)
         if not is_traced((t0, t1, ts)):
             # `check_start` lets rounding pass, Diffrax does not.
-            ts = on_device(np.clip(np.asarray(ts), t0, t1), dtype)
+            ts = as_argument(np.clip(np.asarray(ts), t0, t1), dtype)
     # The solver is chosen by `simulate`, so that the programs of models that differ in how stiff they are are the same.
     return Given(system.without_stiffness, t0, t1, ts, inputs, initial)
 
@@ -248,6 +258,7 @@ class _Call:
     solver: Solver  # None: that of the choice
     rtol: Tolerance
     atol: Tolerance
+    scaled: Tolerance  # atol of each entry of the state
     ends: StepEnds
     adjoint: diffrax.AbstractAdjoint | None
     controller: Controller
@@ -264,7 +275,7 @@ class _Call:
         """The largest numbers of steps and of events."""
         return self.asked.max_steps, MOST_EVENTS if self.max_events is None else self.max_events
 
-    @property
+    @functools.cached_property
     def run_by(self) -> Solver:
         """The solver of a run."""
         return SOLVERS[self.choice.solver]() if self.solver is None else self.solver
@@ -286,7 +297,7 @@ class _Call:
         few = room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS
         steps, adjoint, asked = self.controller, self.adjoint, self.asked
         if steps is None:
-            steps = controller_for(system, solver, self.rtol, self.atol, asked.dtmax, asked.control)
+            steps = controller_for(system, solver, self.rtol, self.atol, self.scaled, asked.dtmax, asked.control)
         if adjoint is None:
             adjoint = default_adjoint(is_forwards(self.given), batch_size(self.given), self.known)
         return Options(
@@ -301,9 +312,9 @@ class _Call:
         final = self.choice.final
         if self.controller is not None or not isinstance(self.run_by, diffrax.Tsit5) or (traced and not final):
             return None
-        size = scaled_atol(self.system, self.atol)
+        size = self.scaled
         known = not is_traced((size, self.rtol))
-        floor = on_device(np.divide(size, self.rtol) if known else jnp.divide(size, self.rtol), size.dtype)
+        floor = as_argument(np.divide(size, self.rtol) if known else jnp.divide(size, self.rtol), size.dtype)
         return (
             Watch(self.given.t1, floor, int(SHARE * self.asked.max_steps), of_run=True)
             if final
@@ -334,7 +345,7 @@ class _Call:
                 say_of_members(number, texts, "runs that stopped", hint, self.throw, stacklevel=5)
                 checked = False
         x = raised(outcome.x, outcome.result, has_events, *self.bounds) if checked else outcome.x
-        return self._solution(outcome, outcome.stats, (outcome.ts, x, outcome.discrete), outcome.memory)
+        return self._solution(outcome, outcome.stats, (jnp.asarray(outcome.ts), x, outcome.discrete), outcome.memory)
 
     def outside(self) -> Solution:
         """The solution where values are known. Runs are repeated with an implicit solver, or with more room for events,
@@ -405,7 +416,7 @@ class _Call:
         if outcome.held is not None:
             solution = eqx.tree_at(lambda s: s.system, solution, system.holding(outcome.held))
         (t, x), (steps, events) = outcome.last, self.bounds
-        stopped = Stopped(t, x, outcome.result, given.t0, given.t1, steps, self.rtol, scaled_atol(system, self.atol))
+        stopped = Stopped(t, x, outcome.result, given.t0, given.t1, steps, self.rtol, self.scaled)
         return SimulationError(explain(solution, stopped, outcome.found.x, is_implicit(self.run_by), events))
 
 

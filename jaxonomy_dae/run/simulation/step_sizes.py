@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ...base.aliases import Args, Controller, Numeric, Solver, State, Time, Times, Tolerance
 from ...base.errors import ModelError
-from ...host.staging import is_traced, joined, on_device
+from ...host.staging import as_argument, is_traced, joined
 from ...solve.adjoint.ends import End, ending
 from ...solve.adjoint.resting import still
 from ...solve.methods.solve import step_control
@@ -35,15 +35,21 @@ def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Tolerance:
     if is_traced((typical, atol)):
         return atol * jnp.where(nominal != 1, nominal, jnp.minimum(typical, 1.0)).astype(atol.dtype)
     size = np.where(nominal != 1, nominal, np.minimum(np.asarray(typical), 1.0))
-    return on_device(np.asarray(atol) * size, atol.dtype)
+    return as_argument(np.asarray(atol) * size, atol.dtype)
 
 
 def controller_for(
-    system: AcausalSystem, solver: Solver, rtol: Tolerance, atol: Tolerance, dtmax: Time, control: Sequence[str] = ()
+    system: AcausalSystem,
+    solver: Solver,
+    rtol: Tolerance,
+    atol: Tolerance,
+    scaled: Tolerance,
+    dtmax: Time,
+    control: Sequence[str] = (),
 ) -> Controller:
-    """The step-size controller for these tolerances, the absolute ones in units of the nominal values. If the user
-    gives no longest step, it is bounded by the period of the waves that drive the model."""
-    controller: Controller = step_control(solver, rtol, scaled_atol(system, atol), dtmax=dtmax)
+    """The step-size controller for these tolerances; `scaled` is `scaled_atol(system, atol)`. If the user gives no
+    longest step, it is bounded by the period of the waves that drive the model."""
+    controller: Controller = step_control(solver, rtol, scaled, dtmax=dtmax)
     if control:
         controller = with_variables(system, controller, solver, control, atol)
     if dtmax is not None or not system.plan.waves:

@@ -1,6 +1,7 @@
 """The Jacobian of a block at a point, in NumPy, and what makes it singular there."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -10,10 +11,9 @@ import scipy.sparse as sp
 from ...base.tolerances import KNOWN, RANK
 from ...compile.lowering.schedule import AnyStep, SparseStep
 from ...compile.model.group import Point, QuantityGroup
-from ...graph.judgement.rank import Rank, rank_of
+from ...graph.judgement.rank import DECOMPOSED_UPTO, Rank, are_evident, rank_of
 from ...graph.judgement.sparse_rank import SparseRank, sparse_rank_of
 
-DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
 MOVED = 1e-3  # of what a Jacobian depends on, relative, to see whether it makes the Jacobian regular
 
 
@@ -47,29 +47,53 @@ class Block:
     equations: tuple[QuantityGroup, ...]
     unknown: np.ndarray
 
-    def matrix(self, of_slots: Callable[[QuantityGroup], np.ndarray]) -> Any:
-        """A sparse matrix from numbers by slots, (n, slots) of each group of equations."""
-        rows, columns, entries = [], [], []
+    @functools.cached_property
+    def _places(self) -> tuple[list[tuple[np.ndarray, np.ndarray]], tuple[np.ndarray, np.ndarray]]:
+        """For each group of equations, the instances and slots that hold unknowns; and the rows and columns of all of
+        them."""
+        rows, columns, inside = [], [], []
         for first, group in self._with_rows():
             place = self._columns(group)
             instance, slot = np.nonzero(place >= 0)
+            inside.append((instance, slot))
             rows.append(first + instance)
             columns.append(place[instance, slot])
-            entries.append(of_slots(group)[instance, slot])
-        places = np.concatenate(rows), np.concatenate(columns)
-        shape = (sum(map(len, self.equations)), len(self.unknown))
-        return sp.csr_array((np.concatenate(entries), places), shape=shape)
+        return inside, (np.concatenate(rows), np.concatenate(columns))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The numbers of equations and of unknowns."""
+        return sum(map(len, self.equations)), len(self.unknown)
+
+    def _entries(self, of_slots: Callable[[QuantityGroup], np.ndarray]) -> np.ndarray:
+        inside, _ = self._places
+        return np.concatenate([of_slots(group)[at] for group, at in zip(self.equations, inside, strict=True)])
+
+    def matrix(self, of_slots: Callable[[QuantityGroup], np.ndarray]) -> Any:
+        """A sparse matrix from numbers by slots, (n, slots) of each group of equations."""
+        return sp.csr_array((self._entries(of_slots), self._places[1]), shape=self.shape)
 
     def jacobian(self, known: Known) -> Any:
         """∂(residuals)/∂(unknowns)."""
         return self.matrix(lambda group: group.partials(known.at))
+
+    def is_evident(self, known: Known) -> bool:
+        """True if the equations are independent at a glance, as `are_evident`."""
+
+        def dense(of_slots: Callable[[QuantityGroup], np.ndarray]) -> np.ndarray:
+            out = np.zeros((1, *self.shape))
+            np.add.at(out[0], self._places[1], self._entries(of_slots))
+            return out
+
+        errors = dense(lambda group: group.partial_errors(known.at, known.errors))
+        return bool(are_evident(dense(lambda group: group.partials(known.at)), errors)[0])
 
     def rank(self, known: Known) -> Rank | SparseRank | None:
         """The Jacobian's rank; None if it is not finite, which has another cause."""
         matrix, errors = self.jacobian(known), self.matrix(lambda g: g.partial_errors(known.at, known.errors))
         if not np.isfinite(matrix.data).all():
             return None
-        if matrix.shape[0] > DENSE_LIMIT:
+        if matrix.shape[0] > DECOMPOSED_UPTO:
             return sparse_rank_of(matrix, errors)
         return rank_of(matrix.toarray(), errors.toarray())
 

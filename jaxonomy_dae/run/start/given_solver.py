@@ -13,7 +13,7 @@ from ...base.errors import ModelError
 from ...base.tolerances import solved
 from ...solve.linear.dense import least_squares
 from .ladder import FAILED, GIVEN, Found
-from .sizes import Sizes, column_sizes, row_sizes, soft_weight, weighed
+from .sizes import Sizes, column_sizes, row_sizes, soft_weight, terms_of, weighed
 
 MAX_STEPS = 1000  # of a solver of the user's, some of which take many cheap steps
 
@@ -52,7 +52,7 @@ def find_root_with(
 
     dtype = start.dtype
     value, jacobian = linearized(start)
-    unit = column_sizes(value, jacobian, sizes)
+    unit = column_sizes(terms_of(value, magnitude(start)), jacobian, sizes)
     largest = jnp.max(jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian * unit[None, :]), 0), axis=1, initial=0.0)
     weight = 1 / jnp.where(largest > 0, largest, 1)
     if not square:

@@ -15,14 +15,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from ...base.errors import ModelError
 from ...base.tolerances import solved
 from ...compile.lowering.plan import SystemPlan
 from ...host.cache import PROGRAMS, compiled
 from ...host.platform import precisely
-from ...host.staging import is_staged, is_traced, on_device
+from ...host.staging import as_argument, is_staged, is_traced
 from ...solve.linear.dense import least_squares
 from ...solve.linear.newton import twice
 from ...solve.linear.sparse import sparse_jacobian
@@ -35,7 +34,7 @@ from .ladder import FAILED, STAGED, Found, find_root
 from .problem import InitialProblem, bounds_of, chooses, guessed_from, independent_rows
 from .rows import InitialRows, initial_rows
 from .search import Look
-from .sizes import Sizes, column_sizes, row_sizes, weighed
+from .sizes import Sizes, column_sizes, row_sizes, terms_of, weighed
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
 
@@ -160,7 +159,7 @@ def _substituted(problem: InitialProblem, order: Substitution) -> Found:
         x, _ = jax.lax.scan(lambda w, _: (w - over * problem.function(w)[order.row], None), start, length=order.levels)
     at = problem.look(x)
     measured = sizes._replace(nominal=sizes.nominal / unit, known=sizes.known / unit)
-    unit = unit * column_sizes(at.value, at.jacobian * unit, measured)
+    unit = unit * column_sizes(terms_of(at.value, at.terms), at.jacobian * unit, measured)
     size, noise = row_sizes(weighed(at.jacobian), x, sizes, unit, at.terms)
     limit = solved(start.dtype) * size + noise
     holds = jnp.all(jnp.abs(at.value) <= limit) & jnp.all(jnp.isfinite(at.jacobian))
@@ -195,7 +194,7 @@ def search_outside(
     None where values are not known, as inside jit, and where the search is another one."""
     plan, system = system.plan, system.without_stiffness
     system, t0, inputs, initial = known = jax.tree.map(
-        lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, Tracer) else leaf, (system, t0, inputs, initial)
+        lambda leaf: jax.lax.stop_gradient(leaf) if is_traced(leaf) else leaf, (system, t0, inputs, initial)
     )
     if is_traced(known):
         return None
@@ -206,7 +205,7 @@ def search_outside(
     n, dtype = plan.n_state + len(unknown), system.parameters.values.dtype
 
     def looked(w: Any) -> Any:
-        return _compiled_look(system, t0, inputs, initial, solve_for, on_device(w))
+        return _compiled_look(system, t0, inputs, initial, solve_for, as_argument(w))
 
     first = looked(np.full(n, np.nan, dtype))
     if is_traced(first):  # a network may close over a traced value
@@ -229,7 +228,7 @@ def search_outside(
         if chooses(plan, rows):
             start = guessed_from(plan, rows, look_at_all, start, first.typical)
         root = find_root(look, m, start, first.sizes, core, soft=soft, bounds=bounds, typical=first.typical)
-    return jax.tree.map(on_device, root)
+    return jax.tree.map(as_argument, root)
 
 
 def known_start(system: Any, t0: Any, inputs: Any, initial: Mapping[str, Any] | None) -> InitialPoint | None:
@@ -350,7 +349,7 @@ def is_consistent(found: InitialPoint) -> Any:
     """True if all rows hold, to rounding."""
     # What is not traced is compared by NumPy: each operation by itself would be a program to compile.
     parts: Any = (found.residual, found.limit, found.x, found.solved)
-    traced = any(isinstance(part, Tracer) for part in parts)
+    traced = is_traced(parts)
     xp: Any = jnp if traced else np
     residual, limit, x, solved = parts if traced else map(np.asarray, parts)
     return xp.all(xp.abs(residual) <= limit) & xp.all(xp.isfinite(xp.append(x, solved)))
@@ -370,8 +369,8 @@ def find_initial(
         raise ModelError(f"t0 must be a time, a number; got {t0!r}. Values at the start go to initial={{...}}")
     check_initial(system, initial)
     inputs = read_inputs(system.plan, dtype, inputs)
-    initial = {name: on_device(v, dtype) for name, v in sorted((initial or {}).items())}
-    arguments = (system.without_stiffness, on_device(t0, dtype), inputs, initial, solve_for)
+    initial = {name: as_argument(v, dtype) for name, v in sorted((initial or {}).items())}
+    arguments = (system.without_stiffness, as_argument(t0, dtype), inputs, initial, solve_for)
     if not is_staged(arguments):
         begun = search_outside(*arguments) if solver is None else None
         found = _compiled(*arguments, solver, begun)

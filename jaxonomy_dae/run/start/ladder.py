@@ -35,7 +35,7 @@ from ...solve.linear.arrays import Numbers, Verdict, loop, namespace, where
 from . import gauss_newton, homotopy
 from .probing import Probed, probed
 from .search import Base, Curve, Descent, Equations, Judged, Look, Probe, Rung, Search
-from .sizes import Sizes, column_sizes, row_sizes, weighed
+from .sizes import Sizes, column_sizes, row_sizes, terms_of, weighed
 
 METHODS = (
     "the start was consistent",
@@ -142,7 +142,7 @@ def _climb(equations: Equations) -> Found:
     xp, sizes, start, dtype = equations.xp, equations.sizes, equations.origin[: equations.n], equations.dtype
     # A start that holds, as most do, needs no rung: in a batch of such starts the loop does not run at all.
     at = equations.look(start)
-    unit = column_sizes(at.value, at.jacobian, sizes)
+    unit = column_sizes(terms_of(at.value, at.terms), at.jacobian, sizes)
     size, noise = row_sizes(weighed(at.jacobian), start, sizes, unit, at.terms)
     stays = xp.all(xp.abs(at.value) <= close(dtype) * size) & xp.all(xp.isfinite(at.jacobian))
     stays &= xp.all((sizes.known > 0) | xp.any(at.jacobian != 0, axis=0))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...solve.linear.arrays import Numbers, Verdict, where
 from .search import Equations, Look, Probe, Search
-from .sizes import column_sizes
+from .sizes import column_sizes, terms_of
 
 # Distances from the start at which slopes are compared: a slope that grows as the p-th power differs by 16^p between
 # them.
@@ -38,14 +38,15 @@ def probed(equations: Equations, search: Search, at: Look) -> Probed:
     first, last = search.probe == Probe.START, search.probe == Probe.NEAR
     flat = where(first, (sizes.known == 0) & ~xp.any(jacobian != 0, axis=0), search.flat)
     goes_on = first & xp.all(xp.isfinite(value)) & xp.any(flat) | (search.probe == Probe.FAR) | last
-    start, value = where(first, search.trial, search.base.at), where(first, value, search.first)
+    start = where(first, search.trial, search.base.at)
+    value = where(first, terms_of(value, at.terms), search.first)
     slopes, before = xp.abs(jacobian), xp.abs(search.base.jacobian)
     comparable = flat[None, :] & last & (slopes > 0) & (before > 0) & xp.isfinite(before)
     growth = xp.log(where(comparable, before / slopes, 1.0)) / float(np.log(PROBES[0] / PROBES[1]))
     power = 1 + xp.clip(growth, 0, 8)
     known = where(first, jacobian, where(flat[None, :] & ~last, jacobian, search.base.jacobian))
     implied = column_sizes(where(equations.soft, 0.0, value), known / power, sizes, power)
-    unit = where(first | last, implied, search.unit)
+    unit = where(first | (last & flat), implied, search.unit)
     distance = where(first, PROBES[0], where(last, 0.0, PROBES[1]))
     trial = start + distance * xp.append(equations.array(flat), equations.array(0.0))
     return Probed(goes_on, unit, flat, start, trial, known)

@@ -55,9 +55,19 @@ def row_sizes(
     return size, xp.where(eps * weigh(xp.abs(x)) > DIGIT * size, 0, noise)
 
 
+def terms_of(value: Numbers, terms: Numbers | None) -> Numbers:
+    """The sizes of the terms of each row, or its value where they are not known. Where a row holds, its value is
+    rounding and tells no size: the angle of a pendulum that hangs from a point found to 1e-16 is not of that size."""
+    if terms is None:
+        return value
+    xp = namespace(value)
+    return xp.where(xp.isfinite(terms), xp.maximum(terms, xp.abs(value)), value)
+
+
 def column_sizes(value: Numbers, jacobian: Numbers, sizes: Sizes, power: Numbers | None = None) -> Numbers:
     """A size for every unknown: as known, or else what its rows imply, |∂F/∂xⱼ|·xⱼ being of the size of their other
-    terms; 1 where nothing is known. With `power`, shape (m, n), terms are |jacobian|·xⱼ**power."""
+    terms; 1 where nothing is known. With `power`, shape (m, n), terms are |jacobian|·xⱼ**power. `value` is the size of
+    what stands in each row at the start, as by `terms_of`."""
     xp = namespace(jacobian)
     tiny, huge = float(xp.finfo(jacobian.dtype).tiny), 1 / float(xp.finfo(jacobian.dtype).eps)
     magnitude = xp.where(xp.isfinite(jacobian), xp.abs(jacobian), 0)
