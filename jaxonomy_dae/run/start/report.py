@@ -13,12 +13,13 @@ from ...compile.diagnosis.lost_cancellation import lost_cancellation
 from ...compile.diagnosis.redundant_constraints import DependentConstraints, ModelAt, dependent_constraints, no_freedom
 from ...compile.diagnosis.wording import listed, quoted
 from ...compile.lowering.plan import SystemPlan
+from ...compile.lowering.remembered import remembered
 from ...compile.model.tables import ZERO
 from ...graph.judgement.sparse_rank import sparse_rank_of
 from ..system.input_values import input_values
 from ..system.sections import SHOWN, Sections, some
 from .constraints_at import constraints_at
-from .initialize import InitialPoint, is_consistent
+from .initialize import InitialPoint, is_consistent, slopes_at_guess
 from .integrated import integrated
 from .ladder import FAILED, METHODS, NEAREST
 from .rows import InitialRows, StartRow, initial_rows, supports
@@ -82,6 +83,7 @@ class InitializationReport(Sections):
         self, system: Any, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = ()
     ):
         self._system, self._found, self._inputs = system, found, inputs
+        self._t0, self._initial, self._solve_for = t0, initial, solve_for
         self._plan: SystemPlan = system.plan
         table = system.parameters.table
         self._key = (self._plan, tuple(sorted(initial or ())), tuple(table.index(n) for n in solve_for))
@@ -199,23 +201,32 @@ class InitializationReport(Sections):
         return [outranked(self._rows, left)] if left else []
 
     def _warning_of_guesses(self) -> list[str]:
-        plan, n = self._plan, len(self._rows.kept) - self._promoted
-        held = {row.quantity for row in self._rows.kept[:n]}
-        parameters, order = np.asarray(self._system.numbers, float), plan.extended.quantities.order
-        left = []
-        for row, value in zip(self._rows.guess, self._x.tolist(), strict=True):
-            if row is None or row.start is None or row.quantity in held or order[row.quantity]:
-                continue
-            guess = row.start.value(parameters) / row.factor
-            tells = integrated(plan)[row.quantity] and abs(guess) > self._rounding(row.quantity)
-            if tells and abs(value - guess) >= (1 - self._relative) * abs(guess):
-                left.append(f"'{plan.quantity_name[row.quantity]}' = {value:.6g}, guessed {guess:.6g}")
-        if not left:
+        place, quantity, variable, factor = _guessed(*self._key)
+        if not len(place):
             return []
+        guess = self._plan.flat.variables.start.values(np.asarray(self._system.numbers, float))[variable] / factor
+        value, rounding = self._x[place], KNOWN * np.asarray(self._system.typical_sizes)[quantity]
+        left = (np.abs(guess) > rounding) & (np.abs(value - guess) >= (1 - self._relative) * np.abs(guess))
+        if not left.any() or self._is_the_only_solution:
+            return []
+        names = self._plan.quantity_name
+        said = [f"'{names[int(quantity[k])]}' = {value[k]:.6g}, guessed {guess[k]:.6g}" for k in np.flatnonzero(left)]
         return [
-            f"the start is far from what is guessed: {', '.join(left)}. If this is another solution than the one that "
+            f"the start is far from what is guessed: {', '.join(said)}. If this is another solution than the one that "
             "is meant, give better guesses, or fix one of them"
         ]
+
+    @property
+    def _is_the_only_solution(self) -> bool:
+        """True if the slopes of the equations are the same at the guesses and at the solution, as those of linear
+        equations are: then guesses choose nothing. Of large models this is not looked at, and nothing is said."""
+        there = self._found.jacobian
+        if there is None or np.ndim(there) != 2:
+            return True
+        there = np.asarray(there, float)
+        begun = slopes_at_guess(self._system, self._t0, self._inputs, self._initial, self._solve_for)[: len(there)]
+        size = np.abs(there).max(axis=1, keepdims=True, initial=0.0)
+        return bool((np.abs(begun - there) <= HALF_OF_THE_DIGITS * size).all())
 
     def _rounding(self, quantity: int) -> float:
         """The size at which a number of this quantity is rounding beside others of the model."""
@@ -456,6 +467,23 @@ class InitializationReport(Sections):
             ("notes", self.notes),
         ]
         return head, [(title, list(entries)) for title, entries in sections if entries]
+
+
+@remembered
+def _guessed(plan: SystemPlan, names: tuple[str, ...], unknown: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    """Of what the model integrates and nothing fixes, declared guesses: places in the state array, quantities,
+    variables, and the variables' factors."""
+    rows = initial_rows(plan, names, unknown)
+    held = {row.quantity for row in rows.kept[: len(rows.kept) - rows.n_soft]}
+    inside, order, index = integrated(plan), plan.extended.quantities.order, plan.variable_index
+    found = [
+        (k, row.quantity, index[row.name], row.factor)
+        for k, row in enumerate(rows.guess)
+        if row is not None and row.start is not None and row.name in index and row.quantity not in held
+        and not order[row.quantity] and inside[row.quantity]
+    ]  # fmt: skip
+    place, quantity, variable, factor = zip(*found, strict=True) if found else ((),) * 4
+    return np.array(place, int), np.array(quantity, int), np.array(variable, int), np.array(factor, float)
 
 
 def outranked(rows: InitialRows, starts: Sequence[str]) -> str:
