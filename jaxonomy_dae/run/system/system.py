@@ -515,7 +515,7 @@ class AcausalSystem(eqx.Module):
         check_range(inputs, t0, t0)
         initial = self.plan.one_by_one(initial)
         found = find_initial(self, t0, inputs, initial, names, solver)
-        found = check(self, found, t0, inputs, initial, names, throw=throw)
+        found = check(self, found, t0, inputs, initial, names, throw=throw, stacklevel=3)
         if solve_for is None:
             return found.x
         table = self.parameters.table
@@ -571,6 +571,24 @@ class AcausalSystem(eqx.Module):
         return export_fmu(
             self, path, outputs=outputs, parameters=parameters, kinds=kinds, platforms=platforms,
             stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
+        )  # fmt: skip
+
+    def to_c(
+        self,
+        path: Any,
+        *,
+        outputs: Sequence[str] | None = None,
+        functions: Sequence[str] | None = None,
+        stop_time: float = 1.0,
+        tolerance: float = 1e-6,
+        overwrite: bool = False,
+    ) -> Any:
+        """Writes this system as C99 into a folder: see `jaxonomy_dae.fmi.write_c`, which has the same arguments."""
+        from ...fmi.plain_c import write_c
+
+        return write_c(
+            self, path, outputs=outputs, functions=functions, stop_time=stop_time, tolerance=tolerance,
+            overwrite=overwrite,
         )  # fmt: skip
 
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
