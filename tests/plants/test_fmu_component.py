@@ -5,12 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fmus import fmpy
+from hybrid_models import Ball, SampledPI
+from hybrid_models import compiled as hybrid
 from problems import compiled
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.fmi import FmuComponent
+from jaxonomy_dae.fmi.calls import Calls, Point
 from jaxonomy_dae.fmi.compilers import compiler_for, this_platform
+from jaxonomy_dae.fmi.described import Described
 from jaxonomy_dae.write import Eq
 
 pytestmark = pytest.mark.skipif(compiler_for(this_platform()) is None, reason="no C compiler on this machine")
@@ -106,3 +110,68 @@ def test_an_fmu_inside_a_diagram(decay):
     solution = simulate(AcausalCompiler(ev, diagram)(), 3.0, rtol=1e-9, atol=1e-11, ts=jnp.array([1.0, 3.0]))
     t = np.array([1.0, 3.0])  # x = 2 + 2·exp(−t) + c·exp(−t/2), x(0) = 2
     np.testing.assert_allclose(solution["f.d_x"], 2 + 2 * np.exp(-t) - 2 * np.exp(-t / 2), atol=1e-7)
+
+
+# --- events ---------------------------------------------------------------------------------------------------------
+
+FALL, G = np.sqrt(2 / 9.81), 9.81
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ball")
+    return hybrid(Ball, "b").export_fmu(folder / "ball.fmu", kinds=["model_exchange"])
+
+
+@pytest.mark.parametrize("saves", [True, False])
+def test_an_event_of_an_fmu_and_its_derivatives(ball, saves):
+    """A ball at the floor: (h, v) → (0, −e·v), whether the FMU's state is saved or events are repeated; a state that is
+    before the crossing by rounding has the event, too; histories are found again after others."""
+    fmu = Described(ball, "f: ")
+    assert fmu.saves_states
+    fmu.saves_states = saves
+    calls = Calls(fmu, ["b.n"], ["b.e", "b.g"])
+    p, none = (0.8, G), np.zeros(0)
+    begun = calls._after(None, Point(0.0, np.array([1.0, 0.0]), none, p, 0), 0.0)
+    down = calls._after((0, False), Point(FALL, np.array([1e-16, -G * FALL]), none, p, int(begun[2])), 0.0)
+    np.testing.assert_allclose(down[:2], [0.0, 0.8 * G * FALL], rtol=1e-12, atol=1e-12)
+    before, after = (Point(0.5, np.array([0.3, 1.0]), none, p, int(n)) for n in (begun[2], down[2]))
+    assert [calls._values(at)[-1] for at in (after, before, after)] == [1.0, 0.0, 1.0]
+    at = Point(FALL, np.array([0.0, -G * FALL]), none, p, int(begun[2]))
+    # By (t, h, v, the next time event), and by (e, g).
+    slopes = calls._jacobian_of_after((0, False), at, 0.0, False)
+    np.testing.assert_allclose(slopes[:2, :3], [[0, 0, 0], [0, 0, -0.8]], atol=1e-7)
+    slopes = calls._jacobian_of_after((0, False), at, 0.0, True)
+    np.testing.assert_allclose(slopes[:2], [[0, 0], [G * FALL, 0]], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_gradients_through_events_of_an_fmu(ball):
+    """Two members of a batch that bounce once, and the gradient of the height by e: g·T·(t − T)."""
+    _, system = imported(ball)
+    ts = jnp.array([0.4, 0.9])
+
+    def heights(e):
+        return simulate(system.with_parameters({"f.b_e": e}), 0.9, rtol=1e-9, atol=1e-11, ts=ts)["f.b_h"]
+
+    e, s = np.array([0.7, 0.8]), 0.9 - FALL
+    expected = np.stack([np.full(2, 1 - G * 0.4**2 / 2), e * G * FALL * s - G * s**2 / 2], axis=1)
+    np.testing.assert_allclose(jax.vmap(heights)(jnp.asarray(e)), expected, atol=1e-8)
+    assert jax.grad(lambda e: heights(e)[-1])(0.8) == pytest.approx(G * FALL * s, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_gradient_through_hidden_variables_is_refused(tmp_path):
+    """A sampled controller keeps what it computed from the state: the run is right, and no gradient is given."""
+    original = hybrid(SampledPI, "c")
+    _, system = imported(original.export_fmu(tmp_path / "loop.fmu", kinds=["model_exchange"]))
+    ts = jnp.linspace(0.0, 1.05, 8)
+    expected = simulate(original, 1.05, rtol=1e-9, atol=1e-11, ts=ts)
+    run = simulate(system, 1.05, rtol=1e-9, atol=1e-11, ts=ts)
+    np.testing.assert_allclose(run["f.c_x"], expected["c.x"], atol=1e-9)
+
+    def last(gain):
+        return simulate(system.with_parameters({"f.c_Kp": gain}), 1.05, ts=ts)["f.c_x"][-1]
+
+    with pytest.raises(Exception, match=r"'der\(c.x\)' depends on 'c.x' at the event, through a discrete variable"):
+        jax.grad(last)(2.0)
