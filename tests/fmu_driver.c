@@ -1,5 +1,5 @@
 /* Drives an FMU by Euler's method, with events, derivatives, and states that are saved and restored: for sanitizers. */
-#include "fmi3_model_exchange.c"
+#include "fmi3.c"
 
 #include <stdio.h>
 
@@ -10,7 +10,7 @@ static void told(fmi3InstanceEnvironment e, fmi3Status s, fmi3String c, fmi3Stri
   printf("%d %s %s\n", (int)s, c, m);
 }
 
-#if CO_SIMULATION
+#if HAS_STEP
 /* The same by the FMU's own solver. */
 static int itself(int steps, double h) {
   fmi3Instance m =
@@ -29,7 +29,7 @@ static int itself(int steps, double h) {
 int main(int argc, char **argv) {
   const int steps = argc > 1 ? atoi(argv[1]) : 1000;
   const double h = argc > 2 ? atof(argv[2]) : 1e-3;
-#if CO_SIMULATION
+#if HAS_STEP
   if (itself(steps > 1000 ? 1000 : steps, h)) return 1;
 #endif
   fmi3Instance m = fmi3InstantiateModelExchange("one", TOKEN, "", false, false, NULL, told);

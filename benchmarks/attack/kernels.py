@@ -73,7 +73,7 @@ class Kernels:
                 self.processes[core] = process
             else:
                 process.kill()
-                process.wait()
+                process.communicate()  # closes its pipes
 
     def verdicts(self, seed: int) -> tuple[dict[str, list[Verdict]], float]:
         """Of the model of a seed, by kernels; and the processor time that all of them took."""

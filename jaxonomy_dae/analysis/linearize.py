@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..base.aliases import Time
 from ..base.errors import ModelError, explained_keywords, nearest
 from ..compile.diagnosis.wording import some
-from ..host.staging import is_staged
+from ..host.staging import is_staged, is_traced
 from ..run.system.input_values import by_entry
 from ..run.system.inputs import read_inputs, value_at
 from ..run.system.system import AcausalSystem
@@ -21,7 +21,7 @@ from .operating_point import OperatingPoint
 from .partials import Driven, Partials, compiled_partials, on_tangent, partials_at
 from .sampled import sampled_space
 from .state_space import StateSpace
-from .steady_state import Drifting, check_system, equilibrium_from, is_traced, point_of
+from .steady_state import Drifting, check_system, equilibrium_from, point_of
 from .tangent import Coordinates, choose_coordinates
 
 

@@ -7,10 +7,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..base.errors import ModelError
+from ..host.staging import is_traced
 from ..run.system.system import AcausalSystem
 
 SHOWN = 8  # states in the text of a point
@@ -86,6 +86,6 @@ class OperatingPoint(eqx.Module):
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, Tracer):
+    if is_traced(value):
         return str(value)
     return f"{float(value):.6g}" if np.ndim(value) == 0 else f"shape {np.shape(value)}"

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 from jax.typing import DTypeLike
 
 from ..base.aliases import PyTree
 from ..base.errors import ModelError
 from ..base.tolerances import KNOWN_ROUNDINGS, MEANT_EQUAL, spacing
 from ..compile.diagnosis.wording import some
+from ..host.staging import is_traced
 from ..run.system.system import AcausalSystem
 from ..run.system.system_at import SystemAt
 from .events_at_rest import RestingEvents, resting_events, ticked
@@ -91,7 +91,7 @@ def sampled_space(system: AcausalSystem, point: Driven, partials: Partials, coor
         whole = jax.scipy.linalg.expm(flow * duration) @ alike[now] @ whole
     y_x, y_u, y_z = partials.of_outputs
     read = jnp.concatenate([y_x @ follow, y_z, y_u, jnp.zeros((len(point.outputs), 1), dtype)], axis=1) @ first
-    if not isinstance(fine, Tracer) and not bool(fine):
+    if not is_traced(fine) and not bool(fine):
         raise ModelError("hidden constraints depend on what a clock writes: states jump at its ticks, which have no "
                          "linear model yet")  # fmt: skip
     whole, read = jnp.where(fine, whole, jnp.nan), jnp.where(fine, read, jnp.nan)

@@ -7,12 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Complex, Float
 
 from ..base.errors import ModelError
 from ..base.optional import optional_module
 from ..compile.diagnosis.wording import counted
+from ..host.staging import is_traced
 from .response import FrequencyResponse
 
 SHOWN = 6  # rows and columns of matrices that are printed
@@ -101,7 +101,7 @@ class StateSpace(eqx.Module):
 
     def __repr__(self):
         lines = [self._head()]
-        if np.ndim(self.A) != 2 or isinstance(self.A, Tracer):
+        if np.ndim(self.A) != 2 or is_traced(self.A):
             return lines[0]
         for letter, matrix, rows, columns in self._tables():
             lines.append(f"{letter}: {_names(rows)} by {_names(columns)}")
@@ -111,7 +111,7 @@ class StateSpace(eqx.Module):
     def _repr_html_(self) -> str:
         """The four matrices as tables that fold."""
         out = [f"<p><code>{self._head()}</code></p>"]
-        if np.ndim(self.A) != 2 or isinstance(self.A, Tracer):
+        if np.ndim(self.A) != 2 or is_traced(self.A):
             return out[0]
         for letter, matrix, rows, columns in self._tables():
             head = "".join(f"<th>{escape(n)}</th>" for n in ("", *columns[:SHOWN]))

@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 
-from ..base.aliases import Args, PyTree, Time
+from ..base.aliases import Args, Time
 from ..base.errors import ModelError, SteadyStateError, explained_keywords, nearest
 from ..compile.diagnosis.wording import some
-from ..host.staging import is_staged
+from ..host.staging import is_staged, is_traced
 from ..run.start.check import check
 from ..run.start.initialize import find_initial
 from ..run.system.inputs import read_inputs
@@ -136,11 +135,6 @@ def point_of(
     relative = jnp.abs(found.residual) / jnp.where(found.limit > 0, found.limit, 1)
     resting = system.holding(found.q) if len(found.q) else system
     return OperatingPoint(x, resting, t, inputs, jax.lax.stop_gradient(jnp.max(relative, initial=0.0)))
-
-
-def is_traced(tree: PyTree) -> bool:
-    """True if a leaf is a tracer, whose value cannot be read."""
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def check_system(system: object):

@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 
 from ..base.aliases import PyTree
 from ..base.errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..base.optional import optional_module
 from ..host.cache import compiled
+from ..host.staging import is_traced
 from ..run.simulation.labelled import dataset_of
 from ..run.simulation.simulate import simulate
 from ..run.simulation.solution import Solution
@@ -168,7 +168,7 @@ def _raise_first(
     """Runs the function by itself for the first row that contains NaN, so that it raises its error; adds which row it
     was."""
     arrays = [leaf for leaf in jax.tree.leaves((results, rows)) if eqx.is_inexact_array(leaf)]
-    if any(isinstance(leaf, Tracer) for leaf in (*arrays, *jax.tree.leaves(system))):
+    if is_traced((arrays, system)):
         return
     count = len(rows[0])
     failed = np.zeros(count, bool)
@@ -201,13 +201,13 @@ def _values(system: AcausalSystem, name: str, given: object) -> Any:
         either = f" or (k, {', '.join(map(str, shape))})" if shape else ""
         raise ModelError(f"the values of parameter '{name}' need shape (k,){either}, k ≥ 1; got {values.shape}")
     places = np.array([table.settable(one) for one in table.one_by_one(name)])
-    if not isinstance(values, Tracer):
+    if not is_traced(values):
         table.check(places, np.asarray(values).reshape(len(values), -1))
     return values
 
 
 def _span(values: PyTree) -> str:
-    if isinstance(values, Tracer):
+    if is_traced(values):
         return f"{len(values)} values"
     least, largest = float(np.min(values)), float(np.max(values))
     return f"{least:g}" if len(values) == 1 else f"{len(values)} values from {least:g} to {largest:g}"

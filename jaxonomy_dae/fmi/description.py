@@ -63,7 +63,10 @@ def unit_of_rate(unit: str) -> str:
     found = _read(unit)
     if found is None:
         return ""
-    return "s-1" if unit == "1" else str(rate(found, 1).text)
+    if unit == "1":
+        return "s-1"
+    longer = f"{unit}2" if unit.endswith("/s") else f"({unit})/s"
+    return str(rate(found, 1).text) or (longer if unit and _read(longer) else "")
 
 
 def _read(unit: str) -> Unit | None:

@@ -170,6 +170,14 @@ def _clamped(cell: Cell) -> str:
     return Cell([inner.own("max"), high], cell.types, cell.out, {}).own("min")
 
 
+def _reduced(cell: Cell) -> str:
+    """Rounds to fewer binary digits; the range stays."""
+    kept, own = int(cell.params["mantissa_bits"]), np.finfo(cell.out)
+    if int(cell.params["exponent_bits"]) != own.nexp:
+        raise NotImplementedError
+    return cell.given[0] if kept >= own.nmant else f"jx_rounded_{_tag(cell.out)}({cell.given[0]}, {own.nmant - kept})"
+
+
 def _shifted(operator: str, signed: bool) -> Callable[[Cell], str]:
     def write(cell: Cell) -> str:
         (a, b), bits = cell.given, 8 * np.dtype(cell.out).itemsize
@@ -202,7 +210,7 @@ ELEMENTWISE: dict[str, Callable[[Cell], str]] = {
     "logistic": _logistic, "integer_pow": _integer_power,
     "is_finite": lambda cell: f"(isfinite({cell.given[0]}) ? 1 : 0)",
     "convert_element_type": _converted, "select_n": _selected, "clamp": _clamped,
-    "copy": lambda cell: cell.given[0], "stop_gradient": lambda cell: cell.given[0],
+    "reduce_precision": _reduced, "copy": lambda cell: cell.given[0], "stop_gradient": lambda cell: cell.given[0],
     "name": lambda cell: cell.given[0],
 }  # fmt: skip
 
@@ -230,6 +238,16 @@ HELPERS: dict[str, str] = {
         "  return a < b ? a : a > b ? b : signbit(a) ? a : b;\n}\n"
     ),
     **_of_floats("static $T jx_sign_$G($T x) { return x > 0 ? 1 : x < 0 ? -1 : x; }\n"),
+    # To nearest, ties to even: what is cut off is added to the bits as an integer, which carries into the exponent.
+    **{
+        f"jx_rounded_{tag}": (
+            f"static {name} jx_rounded_{tag}({name} x, int cut) {{\n"
+            f"  {bits} b;\n  if (x != x) return x;\n  memcpy(&b, &x, sizeof b);\n"
+            f"  b += ((({bits})1 << (cut - 1)) - 1) + (b >> cut & 1);\n  b &= ~((({bits})1 << cut) - 1);\n"
+            "  memcpy(&x, &b, sizeof x);\n  return x;\n}\n"
+        )
+        for tag, name, bits in (("d", "double", "uint64_t"), ("f", "float", "uint32_t"))
+    },
     **_of_floats("static $T jx_pow_$G($T x, $T y) { return pow$S(x, y); }\n"),
     **{
         f"jx_power_{tag}": (

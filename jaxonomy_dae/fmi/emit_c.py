@@ -167,6 +167,7 @@ class Body:
         own = program.arguments[len(closed) :]
         for number_, constant in zip(program.arguments, closed, strict=False):
             self._constants[number_] = constant
+        self._reads: collections.Counter[int] = collections.Counter()  # how often each value is read
         self._last = self._last_uses()
         for k, argument in enumerate(own):
             self._inputs.append(f"a{k}")
@@ -284,6 +285,8 @@ class Body:
                 assert isinstance(operation.given[0], int)
                 self._alias[operation.results[0]] = self._root(operation.given[0])
             last.update(dict.fromkeys(reads, k))
+            self._reads.update(reads)
+        self._reads.update(self._root(a) for a in self.program.results if isinstance(a, int))
         last.update({self._root(a): len(operations) for a in self.program.results if isinstance(a, int)})
         return last
 
@@ -437,7 +440,7 @@ class Body:
         types = [np.dtype(self.program.kind(a).dtype) for a in operation.given]
         try:
             return ELEMENTWISE[operation.primitive](Cell(given, types, np.dtype(out), operation.params))
-        except KeyError:
+        except (KeyError, NotImplementedError):
             raise self._refused(operation) from None
 
     def _refused(self, operation: Operation) -> ModelError:
@@ -457,19 +460,12 @@ class Body:
         group, self._group = self._group, []
         if not group:
             return
-        members = {id(o) for o in group}
-        read_outside = {
-            self._root(a)
-            for o in self.program.operations
-            if id(o) not in members
-            for a in o.given
-            if isinstance(a, int)
-        } | {self._root(a) for a in self.program.results if isinstance(a, int)}
+        inner_reads = collections.Counter(self._root(a) for o in group for a in o.given if isinstance(a, int))
         kind = self.program.kinds[group[0].results[0]]
         stored = {}
         for operation in group:
             (result,) = operation.results
-            if result in read_outside:
+            if self._reads[result] > inner_reads[result]:  # others read it, too
                 stored[result] = self._result(result)
         if not kind.size:
             return

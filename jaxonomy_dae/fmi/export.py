@@ -14,17 +14,16 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..base.errors import ModelError, nearest
-from ..compile.lowering.plan import SystemPlan
 from ..compile.model.array_names import inner_name
-from ..run.start.rows import initial_rows
 from ..run.system.system import AcausalSystem
 from .compilers import TARGETS, compiler_for, shared_library, this_platform
+from .content import Content
 from .dependencies import dependencies
 from .description import Structure, Variable, model_description, structured, unit_of_rate
-from .model_c import CVariable, Layout, model_files
-from .programs import Programs, check_exportable
+from .model_c import CVariable, fixed, model_files, table_of_variables
+from .programs import NAMES, check_exportable
 
-SOURCE = "fmi3_model_exchange.c"
+SOURCE = "fmi3.c"
 KINDS = ("model_exchange", "co_simulation")
 CO_SIMULATION_UPTO = 300  # states: a step factorizes a dense matrix, 27 million multiplications at this size
 
@@ -143,7 +142,8 @@ def fmu_files(
             f"kinds: Co-Simulation factorizes dense matrices of up to {CO_SIMULATION_UPTO} states, and this model has "
             f"{len(system.states)}: export it for Model Exchange, kinds=['model_exchange']"
         )
-    model = _Model(system, outputs, parameters, co_simulation)
+    names = [name for name in NAMES if name != "step" or co_simulation]
+    model = _Variables(system, outputs, parameters, names)
     identifier = re.sub(r"\W", "_", stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"m_{identifier}"
 
@@ -152,58 +152,32 @@ def fmu_files(
     def description(token: str) -> str:
         return model_description(
             system.plan.flat.name or stem, identifier, token, model.variables, structure, model.needs_steps,
-            model.programs.steps, stop_time, tolerance,
+            co_simulation, stop_time, tolerance,
         )  # fmt: skip
 
-    files = model_files(
-        model.programs, [v.c for v in model.variables], model.defaults(), model.nominals, model.texts(), tolerance
-    )
+    files, _ = model_files(model.programs, model.defaults(), model.nominals, model.texts(), tolerance)
+    files |= {name: fixed(name) for name in (SOURCE, "fmi3_types.h")}
+    files["variables.c"] = table_of_variables([v.c for v in model.variables])
     content = description("") + "".join(text for _, text in sorted(files.items()))
     digest = hashlib.sha256(content.encode()).hexdigest()
     token = f"{{{digest[:8]}-{digest[8:12]}-{digest[12:16]}-{digest[16:20]}-{digest[20:32]}}}"
     return {**files, "token.h": f'#define TOKEN "{token}"\n'}, description(token), identifier
 
 
-class _Model:
+class _Variables(Content):
     """The variables of an FMU, and where they stand."""
 
     def __init__(
-        self, system: AcausalSystem, outputs: Sequence[str] | None, parameters: Sequence[str] | str, steps: bool
+        self, system: AcausalSystem, outputs: Sequence[str] | None, parameters: Sequence[str] | str,
+        functions: Sequence[str],
     ):  # fmt: skip
-        self.system, self.plan = system, system.plan
-        states = system.states
-        flat = self.plan.flat.variables
-        number = {n: self.plan.variable_index[n] for n in states if n in self.plan.variable_index}
-        fixed = [n for n, v in number.items() if flat.fixed[v] and flat.start.is_number[v]]
-        self.discretes = system.discretes
-        wanted = self._outputs(outputs)
-        self.output_states = [n for n in wanted if n in states]
-        self.output_discretes = [n for n in wanted if n in self.discretes]
-        own = {*states, *self.discretes, *system.inputs}
-        self.programs = Programs(system, [n for n in wanted if n not in own], fixed, steps)
-        self.layout = Layout.of(self.programs)
+        super().__init__(system, outputs, functions)
         self.parameter_names, self.weights = self._parameters(parameters)
         self._traced = self.programs.traced
         self._depend = self._dependencies()
-        self.outputs = [n for n in wanted if n not in own]
-        self.variables = self._variables(wanted)
+        self.variables = self._variables(self.wanted)
 
     # --- names ------------------------------------------------------------------------------------------------------
-
-    def _outputs(self, outputs: Sequence[str] | None) -> list[str]:
-        system, plan = self.system, self.plan
-        if outputs is None:
-            inputs = set(system.inputs)
-            return [*(n for n in system.variables if n not in inputs), *system.discretes]
-        if isinstance(outputs, str):
-            raise ModelError(f"outputs is a list of names; write outputs=[{outputs!r}]")
-        names = list(dict.fromkeys(plan.entry_names(outputs)))
-        for name in names:
-            if name in system.inputs:
-                raise ModelError(f"outputs: '{name}' is an input")
-            if name not in system.discretes and name not in system.states:
-                plan.resolve([name])
-        return names
 
     def _parameters(self, parameters: Sequence[str] | str) -> tuple[list[str], list[int]]:
         """The names of parameters, and the places of weights, that can be set."""
@@ -314,12 +288,11 @@ class _Model:
             variable = Variable(
                 own.name, "output" if name in is_output else "local", "continuous", own, unit=unit,
                 initial="exact" if begins else "calculated", nominal=float(sizes[k]), reinit=jumps,
-                start=np.array(self._start(name)) if begins else None,
+                start=np.array(self.start_of(name)) if begins else None,
             )  # fmt: skip
             self.state_places.append(add(variable, place))
         for k, name in enumerate(system.states):
-            order, inner = _derivative(name)
-            own = c(structured("der(" * order + inner + ")" * order), "UNKNOWN", "NEVER", k)
+            own = c(self.slope_names[k], "UNKNOWN", "NEVER", k)
             variable = Variable(
                 own.name, "local", "continuous", own, initial="calculated", derivative=self.state_places[k],
                 unit=unit_of_rate(self._unit(name)),
@@ -362,7 +335,7 @@ class _Model:
         self.guard_places, self.indicator_places = [], []
         names = () if plan.events is None else plan.events.names[plan.events.n_clocks :]
         for k, text in enumerate(names):
-            own = c(f"events.guard[{k + 1}]", "UNKNOWN", "NEVER", p.nx + p.ny + k)
+            own = c(self.guard_names[k], "UNKNOWN", "NEVER", p.nx + p.ny + k)
             told = f"Falls through zero where the condition of an event becomes true: {text}"
             self.guard_places.append(
                 add(Variable(own.name, "output", "continuous", own, initial="calculated", description=told))
@@ -385,12 +358,6 @@ class _Model:
         for _ in range(order):
             unit = unit_of_rate(unit)
         return unit
-
-    def _start(self, name: str) -> float:
-        v = self.plan.variable_index[name]
-        start = self.plan.flat.variables.start[v]
-        assert start is not None
-        return start.value(np.zeros(0))
 
     # --- the description and the tables of the C code ---------------------------------------------------------------
 
@@ -421,53 +388,6 @@ class _Model:
         ]  # fmt: skip
         return Structure(outputs, derivatives, indicators, calculated)
 
-    @property
-    def nominals(self) -> np.ndarray:
-        return np.asarray(self.system.state_sizes, float)[: self.programs.nx]
-
-    def defaults(self) -> np.ndarray:
-        """The numbers of a new instance, shape (layout,)."""
-        out = np.zeros(self.layout.size)
-
-        def put(name: str, values: Any) -> None:
-            begin, count = self.layout.places[name]
-            out[begin : begin + count] = np.ravel(values)
-
-        put("p", self.programs.p)
-        put("u", [0.0 if d is None else d for d in self.plan.inputs.defaults])
-        put("s", [self._start(name) for name in self.programs.starts])
-        for k, w in enumerate(self.programs.weights):
-            put(f"w{k}", w.value)
-        return out
-
-    def texts(self) -> dict[str, Sequence[str]]:
-        """The texts of messages."""
-        plan = self.plan
-        slopes = [self.variables[k].name for k in self.slope_places]
-        outputs = [self.variables[k].name for k in (*self.output_places, *self.guard_places)]
-        return {
-            "unknowns": [*slopes, *outputs],
-            "rows": _rows_of_start(plan, self.programs.starts),
-            "carried": self.system.carried,
-            "events": () if plan.events is None else plan.events.names,
-        }
-
-
-def _rows_of_start(plan: SystemPlan, starts: Sequence[str]) -> list[str]:
-    """The texts of the equations that determine a start, in their order in `InitialPoint.residual`."""
-    rows = initial_rows(plan, tuple(starts))
-    names = [f"the start of {row.name}" for row in rows.kept]
-    if rows.direct:
-        return names
-    equations = [plan.describe(int(e)) for planned in plan.constraints for e in planned.equation.equation]
-    left = [equation for step in plan.steps if step.carried for equation in step.left]
-    return [*equations, *(plan.describe(int(e)) for found in left for e in found.equation), *names]
-
 
 def _belongs(weight: str, network: str) -> bool:
     return weight == network or weight.startswith((f"{network}.", f"{network}["))
-
-
-def _derivative(name: str) -> tuple[int, str]:
-    order, inner = inner_name(name)
-    return order + 1, inner

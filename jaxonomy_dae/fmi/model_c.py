@@ -53,7 +53,7 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True)
 class CVariable:
-    """A variable as the C code sees it; see `fmi3_model_exchange.c`."""
+    """A variable as the C code sees it; see `fmi3.c`."""
 
     kind: str
     settable: str
@@ -80,12 +80,41 @@ def _table(declaration: str, entries: Sequence[str]) -> str:
     return f"static const {declaration}[] = {{\n  " + ",\n  ".join(lines) + "\n};\n"
 
 
+# The sizes of a model and the switches of its functions, for `run.c`.
+HAS = ("forward", "event", "step")
+OF_TEXTS = {"unknowns": "field", "rows": "start", "carried": "event", "events": "event"}  # what has these messages
+
+
+def sizes_of(programs: Programs, layout: Layout, names: dict[str, Sequence[str]], work: int) -> dict[str, int]:
+    """The numbers of `model.h` by name."""
+    return {
+        "NX": programs.nx, "NZ": programs.nz, "NY": programs.ny, "NG": programs.ng, "NC": programs.nc,
+        "ND": layout.size, "N_ROWS": len(names["rows"]), "N_EVENTS": len(names["events"]), "WORK": work,
+        **{f"HAS_{name.upper()}": int(name in programs.names) for name in HAS},
+        "LOOKS": LOOKS, "ENDED_AT": 2, "STUCK_AT": 3, "AT_T": layout["t"], "AT_X": layout["x"], "AT_Z": layout["z"],
+        "AT_GUARDS": layout["guards"], "AT_CLOCKS": layout["clocks"], "AT_RUN": layout["run"],
+    }  # fmt: skip
+
+
+def header(sizes: dict[str, int], tolerance: float) -> str:
+    """`model.h`."""
+    reals = {
+        "TOLERANCE": tolerance, "DRIFT": DRIFT, "RESOLUTION": RESOLUTION * EPS, "BAND": BAND * EPS, "ABOVE": ABOVE,
+        "RESTS": RESTS, "ABSOLUTE": ABSOLUTE,
+    }  # fmt: skip
+    return (
+        "/* The sizes of the model. */\n#ifndef MODEL_H\n#define MODEL_H\n\n"
+        + "".join(f"#define {name} {value}\n" for name, value in sizes.items())
+        + "".join(f"#define {name} {number(value, np.float64)}\n" for name, value in reals.items())
+        + "\n#endif\n"
+    )
+
+
 def model_files(
-    programs: Programs, variables: Sequence[CVariable], defaults: np.ndarray, nominals: np.ndarray,
-    names: dict[str, Sequence[str]], tolerance: float,
-) -> dict[str, str]:  # fmt: skip
-    """The C files by name. `defaults` are the numbers of a new instance; `names` has texts for messages: `unknowns`,
-    `rows` of the start, `carried` variables, `events`.
+    programs: Programs, defaults: np.ndarray, nominals: np.ndarray, names: dict[str, Sequence[str]], tolerance: float
+) -> tuple[dict[str, str], dict[str, int]]:  # fmt: skip
+    """Returns (the C files by name, the sizes of the model). `defaults` are the numbers of a new instance; `names` has
+    texts for messages: `unknowns`, `rows` of the start, `carried` variables, `events`.
 
     **Raises:**
 
@@ -94,45 +123,41 @@ def model_files(
     source = Source()
     functions = {name: source.function(program, f"p_{name}") for name, program in programs.traced.items()}
     layout = Layout.of(programs)
-    sizes = {
-        "NX": programs.nx, "NZ": programs.nz, "NY": programs.ny, "NG": programs.ng, "NC": programs.nc,
-        "ND": layout.size, "N_VARIABLES": len(variables), "N_ROWS": len(names["rows"]),
-        "N_EVENTS": len(names["events"]), "WORK": max(f.work for f in functions.values()),
-        "CO_SIMULATION": int(programs.steps), "LOOKS": LOOKS, "ENDED_AT": 2, "STUCK_AT": 3,
-        "AT_T": layout["t"], "AT_X": layout["x"], "AT_Z": layout["z"], "AT_GUARDS": layout["guards"],
-        "AT_CLOCKS": layout["clocks"], "AT_RUN": layout["run"],
-    }  # fmt: skip
-    reals = {
-        "TOLERANCE": tolerance, "DRIFT": DRIFT, "RESOLUTION": RESOLUTION * EPS, "BAND": BAND * EPS, "ABOVE": ABOVE,
-        "RESTS": RESTS, "ABSOLUTE": ABSOLUTE,
-    }  # fmt: skip
-    header = (
-        "/* The sizes of the model. */\n#ifndef MODEL_H\n#define MODEL_H\n\n"
-        + "".join(f"#define {name} {value}\n" for name, value in sizes.items())
-        + "".join(f"#define {name} {number(value, np.float64)}\n" for name, value in reals.items())
-        + "\n#endif\n"
+    sizes = sizes_of(programs, layout, names, max(f.work for f in functions.values()))
+    body = "\n".join(
+        [
+            "/* The equations of the model, and its texts. */\n",
+            source.text,
+            *(_wrapper(programs, layout, name, function) for name, function in functions.items()),
+            _table("double DEFAULTS", [number(v, np.float64) for v in defaults]),
+            _table("double NOMINALS", [number(v, np.float64) for v in nominals]),
+            *(table_of_texts(name.upper(), t) for name, t in names.items() if OF_TEXTS[name] in programs.names),
+        ]
     )
+    return {"model.h": header(sizes, tolerance), "model.c": body} | {name: fixed(name) for name in RUN_FILES}, sizes
+
+
+def fixed(name: str) -> str:
+    """A C file that is the same for all models."""
+    return files("jaxonomy_dae.fmi").joinpath("c", name).read_text()
+
+
+def table_of_variables(variables: Sequence[CVariable]) -> str:
+    """`variables.c`: what an importer sees."""
     rows = [
         f"{{{v.kind}, {v.settable}, {v.place}, {v.size}, {v.start}, {int(v.known)}, {number(v.low, np.float64)}, "
         f"{number(v.high, np.float64)}, {text(v.name)}}}"
         for v in variables
     ]
-    body = "\n".join(
-        [
-            "/* The tables and the equations of the model; included by fmi3_model_exchange.c. */\n",
-            source.text,
-            *(_wrapper(programs, layout, name, function) for name, function in functions.items()),
-            _table("Variable VARIABLES", rows),
-            _table("double DEFAULTS", [number(v, np.float64) for v in defaults]),
-            _table("double NOMINALS", [number(v, np.float64) for v in nominals]),
-            *(_table(f"char *const {name.upper()}", [text(t) for t in texts]) for name, texts in names.items()),
-        ]
-    )
-    fixed = {name: files("jaxonomy_dae.fmi").joinpath("c", name).read_text() for name in FIXED}
-    return {**fixed, "model.h": header, "model.c": body}
+    return f"#define N_VARIABLES {len(variables)}\n\n" + _table("Variable VARIABLES", rows)
 
 
-FIXED = ("fmi3_model_exchange.c", "fmi3_types.h")
+def table_of_texts(name: str, texts: Sequence[str]) -> str:
+    """A constant array of strings."""
+    return _table(f"char *const {name}", [text(t) for t in texts])
+
+
+RUN_FILES = ("run.h", "run.c")
 
 
 def _wrapper(programs: Programs, layout: Layout, name: str, function: CFunction) -> str:

@@ -46,6 +46,7 @@ from ..write.events import EventFlag
 
 PROJECTIONS = 4  # Gauss–Newton steps onto the constraints, as many as leave rounding of any drift that is tolerated
 RUN = 6  # numbers of a run in `HybridState.of_run`
+NAMES = ("field", "outputs", "guards", "forward", "reverse", "start", "event", "step", "accept")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,11 +58,13 @@ class Weights:
 
 
 class Programs:
-    """The functions of a system, whose continuous `outputs` are variables by name, and whose `starts` are variables
-    with values that can be set at the initial time; `steps` says whether there is a step of a solver."""
+    """Those of these functions of a system that have `names`; its continuous `outputs` are variables by name, and
+    `starts` are variables with values that can be set at the initial time."""
 
-    def __init__(self, system: AcausalSystem, outputs: Sequence[str], starts: Sequence[str], steps: bool = True):
-        self.system, self.plan, self.steps = system, system.plan, steps
+    def __init__(
+        self, system: AcausalSystem, outputs: Sequence[str], starts: Sequence[str], names: Sequence[str] = NAMES
+    ):  # fmt: skip
+        self.system, self.plan, self.names = system, system.plan, tuple(names)
         self.nx, self.nz = len(self.plan.states), len(self.plan.carried)
         self.starts = tuple(starts)
         self._quantity = self.plan.resolve(outputs) if outputs else (np.zeros(0, np.int64), np.zeros(0))
@@ -77,8 +80,9 @@ class Programs:
     # --- the system at a point --------------------------------------------------------------------------------------
 
     def at(self, p: Array, weights: Sequence[Array]) -> AcausalSystem:
-        """The system with these parameters and weights."""
-        networks = jax.tree.unflatten(self._tree, weights)
+        """The system with these parameters and weights, which are of double precision, whatever the network's are."""
+        own = [w.astype(leaf.value.dtype) for w, leaf in zip(weights, self.weights, strict=True)]
+        networks = jax.tree.unflatten(self._tree, own)
         neural = eqx.combine(networks, self.system.neural)
         return eqx.tree_at(lambda s: (s.parameters.values, s.neural), self.system, (p, neural))
 
@@ -266,12 +270,12 @@ class Programs:
         }  # fmt: skip
         return {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()} | {
             "p": jax.ShapeDtypeStruct(self.p.shape, dtype),
-            "weights": tuple(jax.ShapeDtypeStruct(w.value.shape, w.value.dtype) for w in self.weights),
+            "weights": tuple(jax.ShapeDtypeStruct(w.value.shape, dtype) for w in self.weights),
         }
 
     @functools.cached_property
     def traced(self) -> dict[str, Any]:
-        """All functions as programs by name."""
+        """The functions as programs by name."""
         n = self._numbers
         number, weights = n["t"], n["weights"]
         point = (n["t"], n["x"], n["z"], n["q"], n["p"], n["u"])
@@ -294,9 +298,7 @@ class Programs:
             "step": (self.step, (*point, number, *weights)),
             "accept": (self.accept, (*point, *memory, number, *weights)),
         }
-        if not self.steps:
-            del given["step"]
-        return {name: jax.make_jaxpr(function)(*arguments) for name, (function, arguments) in given.items()}
+        return {name: jax.make_jaxpr(given[name][0])(*given[name][1]) for name in self.names}
 
 
 def _name_of_leaf(path: Sequence[Any]) -> str:

@@ -44,6 +44,7 @@ from .priors import LogNormal as LogNormal
 from .priors import Normal as Normal
 from .problem import Problem as Problem
 from .progress import Progress as Progress
+from .properties import Properties as Properties
 from .table import Table as Table
 from .term import ClosedForm as ClosedForm
 from .training import GradientSteps as GradientSteps

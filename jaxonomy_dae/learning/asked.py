@@ -5,13 +5,18 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from ..base.errors import ModelError, nearest
 from ..compile.diagnosis.unused_parameters import unused_parameters
 from ..compile.model.tables import ZERO
 from ..run.system.system import AcausalSystem
-from .coordinates import Coordinates
+from .coordinates import Coordinate, Coordinates
+from .data import Stacked
+from .experiment import Unknown
 from .filtering import Filter, Innovations, check_model
 from .multiple_shooting import Shooting
+from .priors import is_finite
 from .program import SensorLaw, weights_of
 from .training import Training
 
@@ -134,3 +139,37 @@ def as_asked(c: Coordinates, freeze: Any, start: Any, bounds: Mapping[str, Any] 
     names = [freeze] if isinstance(freeze, str) else freeze
     held = dict(names) if isinstance(names, Mapping) else dict.fromkeys(names)
     return c.bounded(dict(bounds or {})).changed(values, fixed=False).changed(held, fixed=True)
+
+
+def dead_times(delay: Mapping[str, Any], stacked: Stacked, method: Any) -> tuple[Coordinate, ...]:
+    """The coordinates of dead times: between zero and the length of the shortest record that is fitted."""
+    if method not in METHODS:
+        raise ModelError(f"delay= goes with runs, not with method={type(method).__name__}: use method='single'")
+    lasting = np.array([stacked.times[k, count - 1] for k, count in enumerate(stacked.counts)]) - stacked.t0
+    chosen = ~stacked.holdout if (~stacked.holdout).any() else stacked.holdout
+    shortest = int(np.argmin(np.where(chosen, lasting, np.inf)))
+    most = float(lasting[shortest])
+    rows = []
+    for name, given in delay.items():
+        if name not in stacked.inputs and name not in stacked.outputs:
+            known = [*stacked.inputs, *stacked.outputs]
+            raise ModelError(
+                f"delay: '{name}' is neither an input of the experiments nor measured: " + nearest(name, known)
+            )
+        guess = given.guess if isinstance(given, Unknown) else given
+        if not is_finite(guess) or guess < 0:
+            raise ModelError(f"delay of '{name}' is a time ≥ 0 in seconds, or Unknown(guess); got {given!r}")
+        if guess >= most:
+            raise ModelError(
+                f"delay of '{name}' is {guess:g} s, and {stacked.labels[shortest]} lasts {most:g} s, so nothing of it "
+                "would be seen: give less, or a longer record"
+            )
+        is_unknown, spread = isinstance(given, Unknown), getattr(given, "spread", None)
+        size = spread or guess or most / max(stacked.counts[shortest], 1)
+        rows.append(
+            Coordinate(
+                f"delay of {name}", "s", f"delay of {name}", False, False, size, float(guess), low=0.0, high=most,
+                spread=math.inf if spread is None else spread / size, fixed=not is_unknown, centre=guess / size,
+            )
+        )  # fmt: skip
+    return tuple(rows)

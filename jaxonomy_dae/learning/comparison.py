@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.errors import ModelError, explained_keywords, nearest, whole_number
+from ..base.errors import ModelError, check_handed_on, explained_keywords, nearest, whole_number
 from .data import Data
 from .estimate import Estimate
 from .problem import Problem
@@ -56,6 +56,7 @@ def cross_validate(
 
     - `ModelError` for fewer than two experiments, for folds that leave nothing to fit, and for unknown names.
     """
+    check_handed_on("cross_validate", options, problem.fit, ("folds",), ("data",))
     # Those that are held out anyway are no part of it.
     labels = [k for k, one in zip(problem.data.labels, problem.data.experiments, strict=True) if not one.holdout]
     if len(labels) < 2:

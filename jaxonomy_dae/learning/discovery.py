@@ -380,9 +380,7 @@ def _inside(name: str, positions: Any) -> list[str]:
 
 def _refitted(estimate: "Estimate", name: str, law: ClosedForm, start: _Start) -> "Estimate":
     """The fit with a closed form in the network's place, which begins where the estimate ended."""
-    system, c = estimate.system, estimate.objective.coordinates
-    dtype = system.parameters.values.dtype
-    law = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, law)
+    c = estimate.objective.coordinates
     present = np.asarray(law.present)
     problem = estimate.problem.with_law(name, law, estimate.objective.stacked)
     natural = c.natural(estimate.point)

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..base.aliases import PyTree
-from ..base.errors import ModelError, SimulationError, nearest, whole_number
+from ..base.errors import ModelError, SimulationError, check_handed_on, explained_keywords, nearest, whole_number
 from ..run.simulation.solution import Solution
 from ..run.system.system import AcausalSystem
 from .band import Band
@@ -23,6 +23,7 @@ from .problem import Problem
 
 Network = TypeVar("Network", bound=PyTree)
 
+OWN = ("members", "seed", "networks")
 REJECTED = 1e-3  # the probability below which noise is no excuse for a worse fit
 
 
@@ -51,6 +52,7 @@ class Ensemble:
         left = len(self.estimates) - len(self.kept)
         return f"Ensemble(of {len(self.kept)}, χ² {chi2}" + f"; {left} more ended in worse minima" * bool(left) + ")"
 
+    @explained_keywords()
     def band(
         self,
         name: str,
@@ -70,6 +72,7 @@ class Ensemble:
             bands[0].grid, mean, spread, mean - factor * spread, mean + factor * spread, explored, between
         )  # fmt: skip
 
+    @explained_keywords()
     def predict(
         self,
         names: str | Sequence[str],
@@ -114,6 +117,7 @@ def ensemble(
 
     - `ModelError` for names and counts; `SimulationError` if no member can be simulated, with the reason of the first.
     """
+    check_handed_on("ensemble", {k: v for k, v in options.items() if k != "start"}, problem.fit, OWN, ("start",))
     modules = [name for name in problem.trained[1] if name in problem.system.neural]
     if not modules:
         raise ModelError("an ensemble needs networks that are trained: name them in the problem's train=")

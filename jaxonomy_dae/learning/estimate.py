@@ -25,6 +25,7 @@ from .intervals import intervals, noise_intervals, profile
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
 from .program import with_values
+from .properties import Properties, properties
 from .smoothing import followed
 from .table import Table
 from .training import Training
@@ -73,7 +74,8 @@ class Estimate:
 
     @functools.cached_property
     def reasons(self) -> tuple[str, ...]:
-        """What is against this fit, each with what to try next; empty if it can be relied on."""
+        """What is against this fit, each with what to try next; empty if it can be relied on. The first time that
+        residuals of a problem are no noise, a program is compiled that looks for what its equations lack."""
         return reasons(self)
 
     @property
@@ -206,12 +208,13 @@ class Estimate:
     def effective(self) -> dict[str, float]:
         """The number of weights of each network that the data determine."""
         c, free, out = self.objective.coordinates, self.objective.free, {}
-        prior = self.minimum.weights.prior(self.minimum.z).jacobian
-        held = prior @ self.root[free]
+        # By the data's share, not by what priors leave: stiff priors and what nothing determines round away from one.
+        data = self.minimum.weights.informing[:, None] * self.minimum.found.jacobian
+        root = self.root[free]
+        along = data @ root
         for name in dict.fromkeys(g for g, w in zip(c.group, c.is_weight, strict=True) if w):
             chosen = np.array([g == name for g in c.group])[free]  # what is frozen is not determined
-            own = (prior[:, chosen] != 0).any(axis=1)
-            out[name] = float(chosen.sum() - np.sum(held[own] ** 2))
+            out[name] = float(np.sum(along * (data[:, chosen] @ root[chosen])))
         return out
 
     @property
@@ -388,6 +391,7 @@ class Estimate:
 
         return sample(self, draws, chains, warmup, seed)
 
+    @explained_keywords()
     def filtered(
         self, names: str | Sequence[str], experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
@@ -398,12 +402,14 @@ class Estimate:
         """
         return self._followed(names, experiment, "filtered", 1, level)
 
+    @explained_keywords()
     def smoothed(
         self, names: str | Sequence[str], experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
         """As `filtered`, but from all samples of the experiment, including later ones (Rauch, Tung & Striebel 1965)."""
         return self._followed(names, experiment, "smoothed", 1, level)
 
+    @explained_keywords()
     def ahead(
         self, names: str | Sequence[str], steps: int = 1, experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
@@ -446,6 +452,27 @@ class Estimate:
         """
         return discover(self, name, terms, width, most)
 
+    def properties(self, name: str) -> Properties:
+        """Whether a learned law is zero at zero, odd, a function of its input's size alone, rising or falling, by the
+        evidence. Each property is built into the network, and the problem is fitted again with it.
+
+        ```python
+        found = fit.properties("drag")
+        print(found)
+        better = found.fit
+        ```
+
+        **Arguments:**
+
+        - `name`: the name of a trained `equinox.nn.MLP` whose prior the evidence chooses.
+
+        **Raises:**
+
+        - `ModelError` for other names and networks.
+        """
+        return properties(self, name)
+
+    @explained_keywords()
     def plot(
         self, names: str | Sequence[str] | None = None, *, axes: AxesGiven = None, level: float = 0.95
     ) -> np.ndarray:

@@ -125,5 +125,6 @@ class Weights:
         )
 
     def cost(self, z: Float[np.ndarray, " p"], residual: Float[np.ndarray, " m"]) -> float:
-        """½ |W r|² and what the priors add."""
-        return 0.5 * float(np.sum(self.bent(residual)[0] ** 2)) + self.prior_cost(z)
+        """½ |W r|² and what the priors add; infinite where a run leads beyond all numbers."""
+        with np.errstate(over="ignore"):
+            return 0.5 * float(np.sum(self.bent(residual)[0] ** 2)) + self.prior_cost(z)

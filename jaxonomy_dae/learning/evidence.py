@@ -124,7 +124,8 @@ class Evidence:
         for k in inside:
             mine = of_row == k
             weight = float(np.sum(slopes[mine] ** 2))
-            if weight < np.sqrt(np.finfo(float).tiny):  # an output that no weight bends, as a piecewise linear one
+            # An output that no weight bends, as a piecewise linear or a constant one.
+            if weight < np.sqrt(np.finfo(float).tiny) * max(data, 1.0):
                 continue
             spread = stiffness[k] * float(np.sum((slopes[mine] @ root[group]) ** 2))
             determined = float(np.sum(left[mine] ** 2 @ shares)) - spread

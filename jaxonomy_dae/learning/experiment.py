@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jax.typing import ArrayLike
 
-from ..base.errors import ModelError, explained, nearest, whole_number
+from ..base.errors import ModelError, explained, explained_keywords, nearest, whole_number
 from ..compile.lowering.plan import SystemPlan
 from .noise import ESTIMATE, Noise
 from .priors import is_finite
@@ -162,6 +162,7 @@ class Experiment:
 
     # --- parts of a record, and coarser ones ---------------------------------------------------------------------
 
+    @explained_keywords()
     def window(self, start: float, end: float, initial: Mapping[str, float | Unknown] | None = None) -> "Experiment":
         """The samples from `start` to `end`, as an experiment that begins at `start`. `initial` replaces the values
         known at `t0`.
@@ -186,6 +187,7 @@ class Experiment:
         sigma = {name: _rows(level, rows) for name, level in self._noise.items()}
         return self.changed(times=self.times[rows], data=data, sigma=sigma, initial=dict(self.initial) | new, t0=start)
 
+    @explained_keywords()
     def resample(self, times: Numbers) -> "Experiment":
         """The record at other times, by linear interpolation. Samples are NaN if a neighbour is missing, and outside
         the record. Samples with a common neighbour no longer have independent noise; use `decimate` to reduce the
@@ -202,6 +204,7 @@ class Experiment:
             raise ModelError(f"resample: '{varying[0]}' has a noise level for each sample: give one for all")
         return self.changed(times=new, data=self._each(between))
 
+    @explained_keywords()
     def decimate(self, factor: int) -> "Experiment":
         """Every `factor`-th sample, after a low-pass filter without delay against aliasing. Known noise levels decrease
         as for white noise.
@@ -223,6 +226,7 @@ class Experiment:
         sigma = {name: _rows(level, slice(None, None, factor), quieter) for name, level in self._noise.items()}
         return self.changed(times=self.times[::factor], data=data, sigma=sigma)
 
+    @explained_keywords()
     def detrend(self, names: str | Sequence[str] | None = None, degree: int = 1) -> "Experiment":
         """The record without a polynomial trend (least squares), for all signals or the named ones. Degree 0 removes
         the means."""

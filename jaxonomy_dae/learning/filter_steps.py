@@ -116,10 +116,10 @@ def _held(m: Model, discrete: Discrete) -> AcausalSystem:
 def _jacobian(m: Model, t: Instant, x: State) -> Matrix:
     """∂f/∂x of the differential states, algebraic unknowns following them."""
     f, here = len(m.here.plan.states), m.here.at(t, m.inputs)
-    return jax.jacfwd(lambda first: _slopes(here, jnp.concatenate([first, x[f:]])))(x[:f])
+    return jax.jacfwd(lambda first: slopes_of(here, jnp.concatenate([first, x[f:]])))(x[:f])
 
 
-def _slopes(here: SystemAt, x: State) -> Float[Array, " f"]:
+def slopes_of(here: SystemAt, x: State) -> Float[Array, " f"]:
     """The slopes of the differential states, algebraic unknowns following them."""
     if len(here.plan.carried):
         x = here.refined(x, Refinement.ROOT)
@@ -139,7 +139,7 @@ def _intensity(m: Model, t: Instant, x: State) -> Matrix:
     at = jnp.stack([jnp.asarray(value_at(source, t), x.dtype) for source in given])
 
     def slopes(values):
-        return _slopes(m.here.at(t, {**sources, **dict(zip(names, values, strict=True))}), x)
+        return slopes_of(m.here.at(t, {**sources, **dict(zip(names, values, strict=True))}), x)
 
     b = jax.jacfwd(slopes)(at) * jnp.stack([m.driven[name] for name in names])
     return g + b @ b.T

@@ -189,9 +189,21 @@ class Leftover:
         return found
 
     @functools.cached_property
+    def cleaned(self) -> Float[np.ndarray, " m"]:
+        """What would be left over, to first order, of a fit to all samples but outliers; zero at these."""
+        far = self.outliers
+        if not far.any():
+            return self.scores
+        # With numbers in units of A, of which A Aᵀ is the covariance, samples and priors together tell one of each.
+        pulling = self.leverage[far]
+        rest = np.eye(pulling.shape[1]) - pulling.T @ pulling
+        moves = np.linalg.lstsq(rest, pulling.T @ (self.share * self.scores)[far], rcond=None)[0]
+        return np.where(far, 0.0, self.scores + self.leverage @ moves / self.share)
+
+    @functools.cached_property
     def without_outliers(self) -> dict[str, float]:
-        """The probability of each test if single samples that lie far out were as predicted."""
-        return {name: float(p[0]) for name, p in self.tested(np.where(self.outliers, 0.0, self.scores)[None]).items()}
+        """The probability of each test if single samples that lie far out had not been fitted."""
+        return {name: float(p[0]) for name, p in self.tested(self.cleaned[None]).items()}
 
     @functools.cached_property
     def _left(self) -> list[Float[np.ndarray, " _"]]:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from ..base.errors import ModelError, SimulationError, explained_keywords, keywo
 from ..run.simulation.simulate import simulate
 from ..run.system.system import AcausalSystem
 from ..solve.methods.solve import check_tolerances, default_tolerances
-from .asked import METHODS, as_asked, check_start, checked_method, names_to_train, penalties, started
+from .asked import METHODS, as_asked, check_start, checked_method, dead_times, names_to_train, penalties, started
 from .beginnings import GROWING as GRADUAL
 from .beginnings import beginning, silent
 from .clock import Clock
@@ -88,6 +89,9 @@ class Problem:
         laws.
     - `observe`: derived outputs by name, `{"gauge.y": law}`, with `law(solution)` of shape `(n,)`: a function, or an
         Equinox module whose weights may be trained.
+    - `delay`: dead times (s) of inputs and of what is measured, by name, in fits of runs: known numbers, or
+        `Unknown(guess)`. An input acts late, u(t − τ), with its first sample before; a sensor shows y(t − τ), and first
+        what it would show at the start.
     - `method`: `"single"`, each experiment is one run; `"growing"`, the same with growing `horizons`;
         `Shooting(...)`, multiple shooting, for what diverges; or for equations with errors, `Filter(...)`, the
         likelihood of a Kalman filter, or `Innovations(...)`, predictions one step ahead.
@@ -111,6 +115,7 @@ class Problem:
         priors: Mapping[str, Any] | None = None,
         regularize: Mapping[str, Any] | str | float | None = "evidence",
         observe: Mapping[str, Any] | None = None,
+        delay: Mapping[str, float | Unknown] | None = None,
         method: str | Shooting | Filter | Innovations = "single",
         rtol: float | None = None,
         atol: float | None = None,
@@ -118,9 +123,10 @@ class Problem:
         mesh: Mesh | None = None,
         **options: Any,
     ):
+        known = list(dict.fromkeys([*keywords_of(Problem.__init__), *OPTIONS]))
         for name in options:
             if name not in OPTIONS:
-                raise ModelError(wrong_keyword("Problem", name, [*keywords_of(Problem.__init__), *OPTIONS], ELSEWHERE))
+                raise ModelError(wrong_keyword("Problem", name, known, ELSEWHERE))
         if not isinstance(system, AcausalSystem):
             raise ModelError(f"Problem needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
         self.system = system
@@ -140,6 +146,7 @@ class Problem:
         # Names of parameters, one by one, and of networks and sensor laws.
         self.trained = names_to_train(system, self.observers, train)
         self.method = checked_method(system, method)
+        self.delay = dict(delay or {})
         self._stacked = self.stacked(self.data)
         self._layout = self.layout_of(self._stacked)
         unknown = [*self.trained[0], *self._layout.shared, *self._layout.own]
@@ -171,13 +178,15 @@ class Problem:
             kind.append(name)
         if not parameters and not modules and not shared and not own and all(e.fixed for e in extras):
             raise ModelError(
-                "nothing is to be learned: name parameters, networks or sensor laws in train=, or make a start Unknown"
+                "nothing is to be learned: name parameters, networks or sensor laws in train=, or make a start or "
+                "a delay Unknown"
             )
         lengths = tuple(sorted(set(stacked.counts))) if self.observers else ()
         return Layout(
             stacked.outputs, parameters=tuple(parameters), modules=tuple(modules), shared=tuple(shared),
             own=tuple(own), known=tuple(known), kinds=stacked.kinds, options=tuple(self._options.items()),
-            extra=tuple(e.name for e in extras), lengths=lengths if len(lengths) > 1 else (), mesh=self._mesh,
+            extra=tuple(e.name for e in extras), delayed=tuple(self.delay),
+            lengths=lengths if len(lengths) > 1 else (), mesh=self._mesh,
         )  # fmt: skip
 
     @property
@@ -186,6 +195,8 @@ class Problem:
 
     def errors(self, stacked: Stacked) -> tuple[AbstractPredictor, tuple[Coordinate, ...]]:
         """How the method predicts outputs, and the coordinates that come with it."""
+        if self.delay:
+            return Runs(), dead_times(self.delay, stacked, self.method)
         if not isinstance(self.method, Filter | Innovations):
             return Runs(), ()
         structure, extras = structure_and_extras(self.method, self.system, stacked)
@@ -202,11 +213,13 @@ class Problem:
 
     # --- residuals ---------------------------------------------------------------------------------------------
 
+    @explained_keywords()
     def residuals(
         self,
         model: AcausalSystem | None = None,
         *,
         starts: Mapping[str, Any] | None = None,
+        delay: Mapping[str, Any] | None = None,
         observe: Mapping[str, Any] | None = None,
         adjoint: Any = None,
     ) -> dict[str, dict[str, Any]]:
@@ -217,6 +230,7 @@ class Problem:
 
         - `model`: a system like the problem's, such as `equinox.combine(trainable, frozen)`; default: the problem's.
         - `starts`: unknown starts by names, scalars if shared, else shape `(experiments,)`; default: their guesses.
+        - `delay`: dead times by name, in place of the problem's numbers and guesses.
         - `observe`: sensor laws by name, in place of the problem's.
         - `adjoint`: as in `simulate`; `diffrax.ForwardMode()` for Jacobians.
 
@@ -227,7 +241,7 @@ class Problem:
         s = self._stacked
         objective = self.objective_of(s, self.coordinates_of(self._setting, s))
         model = self.system if model is None else model.merged()
-        return residuals(objective, model, dict(starts or {}), dict(observe or {}), adjoint)
+        return residuals(objective, model, dict(starts or {}), dict(delay or {}), dict(observe or {}), adjoint)
 
     def objective_of(self, stacked: Stacked, c: Coordinates, penalties: dict[str, Any] | None = None) -> Objective:
         """The function that a fit minimises."""
@@ -373,6 +387,7 @@ class Problem:
         here = dataclasses.replace(here, watch=None, clock=None)
         return Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
 
+    @explained_keywords()
     def train(
         self,
         how: GradientSteps,
@@ -479,15 +494,18 @@ class Problem:
         other.system = system
         return other
 
-    def with_law(self, name: str, law: Any, stacked: Stacked) -> "Problem":
-        """A copy with another law in place of a network, without a prior."""
+    def with_law(self, name: str, law: Any, stacked: Stacked, penalty: str | None = None) -> "Problem":
+        """A copy with another law in place of a network, of this prior."""
+        dtype = self.system.parameters.values.dtype
+        law = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, law)
         other = copy.copy(self)
         other.system = eqx.tree_at(lambda s: s.neural, self.system, self.system.neural | {name: law})
-        other._stacked, other.penalties = stacked, self.penalties | {name: None}
+        other._stacked, other.penalties = stacked, self.penalties | {name: penalty}
         return other
 
     # --- before a fit ------------------------------------------------------------------------------------------
 
+    @explained_keywords()
     def identifiability(
         self, *, freeze: Mapping[str, float] | Iterable[str] = (), start: Any = None
     ) -> Identifiability:

@@ -16,6 +16,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import diffrax
@@ -33,6 +34,7 @@ from ..run.simulation.simulate import simulate
 from ..run.simulation.solution import Solution
 from ..run.system.system import AcausalSystem
 from .data import Stacked
+from .dead_time import Delays, late, merged
 from .devices import each, each_with_slopes
 
 Inputs: TypeAlias = dict[str, tuple[Float[Array, "*e _"], Float[Array, "*e _"]]]  # times and values of samples by name
@@ -55,7 +57,8 @@ class Layout:
     known: tuple[str, ...]  # starts that are given
     kinds: tuple[tuple[str, str], ...]  # of inputs
     options: tuple[tuple[str, Any], ...]  # of `simulate`
-    extra: tuple[str, ...] = ()  # coordinates that come with a method, before the shared starts
+    extra: tuple[str, ...] = ()  # coordinates that come with a method, or are dead times, before the shared starts
+    delayed: tuple[str, ...] = ()  # inputs and outputs with a dead time, which the extra coordinates are then
     lengths: tuple[int, ...] = ()  # of records, if they differ and there are sensor laws
     mesh: Mesh | None = None  # the devices that share the experiments
 
@@ -189,11 +192,24 @@ class Runs(AbstractPredictor):
     def __call__(self, setting: Setting, shared: Shared, own: Own, told: Conditions) -> Outputs:
         layout, c = setting.layout, told
         system, observers, initial = placed(setting, shared, own, c.known)
+        delays = delays_of(layout, shared)
+        looking, places = c.times, None
+        behind = [name for name in layout.outputs if name in delays]
+        if behind:
+            looking, (now, *then) = merged(c.times, c.t0, [jnp.zeros_like(c.t0), *(delays[name] for name in behind)])
+            places = now, dict(zip(behind, then, strict=True))
         solution = simulate(
-            system, run_end(c.t0, c.times[-1]), t0=c.t0, ts=c.times, initial=initial or None, adjoint=self.adjoint,
-            throw=False, inputs=with_kinds(c.inputs, layout), **setting.options,
+            system, run_end(c.t0, c.times[-1]), t0=c.t0, ts=looking, initial=initial or None, adjoint=self.adjoint,
+            throw=False, inputs=with_kinds(c.inputs, layout, delays), **setting.options,
         )  # fmt: skip
-        return Outputs(outputs_of(solution, observers, layout, c.times.dtype, c.length), None)
+        if places is None:
+            return Outputs(outputs_of(solution, observers, layout, c.times.dtype, c.length), None)
+        columns = []
+        for name in layout.outputs:
+            alone = dataclasses.replace(layout, outputs=(name,))
+            seen = _rows(solution, places[1].get(name, places[0]))
+            columns.append(outputs_of(seen, observers, alone, c.times.dtype, c.length))
+        return Outputs(jnp.concatenate(columns, axis=1), None)
 
 
 def misfit(setting: Setting, predictor: AbstractPredictor, shared: Shared, own: Own, c: Weighted) -> Float[Array, " k"]:
@@ -207,10 +223,19 @@ def misfit(setting: Setting, predictor: AbstractPredictor, shared: Shared, own: 
     return jnp.sum(jnp.where(seen, c.row**2 * (residual**2 / s + jnp.log(s)), 0.0), axis=0)
 
 
-def with_kinds(inputs: Inputs, layout: Layout) -> dict[str, tuple[Array, Array, str]]:
-    """Samples of inputs as `simulate` takes them."""
+def delays_of(layout: Layout, shared: Shared) -> dict[str, Float[Array, ""]]:
+    """The dead times of inputs and outputs, by name."""
+    first = len(shared) - len(layout.shared) - len(layout.extra)
+    return {name: shared[first + k] for k, name in enumerate(layout.delayed)}
+
+
+def with_kinds(inputs: Inputs, layout: Layout, delays: Delays = MappingProxyType({})) -> dict[str, Any]:
+    """Samples of inputs as `simulate` takes them, those with a dead time late."""
     kinds = dict(layout.kinds)
-    return {name: (*samples, kinds[name]) for name, samples in inputs.items()}
+    return {
+        name: late(*samples, kinds[name], delays[name]) if name in delays else (*samples, kinds[name])
+        for name, samples in inputs.items()
+    }
 
 
 def run_end(t0: Float[Array, ""], last: Float[Array, ""]) -> Float[Array, ""]:
@@ -231,7 +256,7 @@ def outputs_of(
     chosen = [name for name in layout.outputs if name in observers]
 
     def derived(rows: int) -> dict[str, Array]:
-        own = solution if rows == len(solution.ts) else _first_rows(solution, rows)
+        own = solution if rows == len(solution.ts) else _rows(solution, slice(rows))
         found = {name: _checked(name, observers[name](own), rows, dtype) for name in chosen}
         return {name: jnp.pad(values, (0, len(solution.ts) - rows), mode="edge") for name, values in found.items()}
 
@@ -242,9 +267,9 @@ def outputs_of(
     return jnp.stack([read[n] for n in layout.outputs], axis=1)
 
 
-def _first_rows(solution: Solution, rows: int) -> Solution:
-    discrete = None if solution.discrete is None else solution.discrete[:rows]
-    return dataclasses.replace(solution, ts=solution.ts[:rows], states=solution.states[:rows], discrete=discrete)
+def _rows(solution: Solution, rows: slice | Int[Array, " n"]) -> Solution:
+    discrete = None if solution.discrete is None else solution.discrete[rows]
+    return dataclasses.replace(solution, ts=solution.ts[rows], states=solution.states[rows], discrete=discrete)
 
 
 def _checked(name: str, values: ArrayLike, rows: int, dtype: DTypeLike) -> Float[Array, " n"]:

@@ -10,7 +10,8 @@ as the model's runs explore them without the network, and outputs of size o, the
 weights of the first layer in units of 1/s, biases there as they act at u = c, and the last layer in units of o. The
 network itself stays what it is.
 
-Modules of a user's own bring their scales along, and so do networks with a prior of a given precision.
+Those with a property (`laws/properties.py`) are measured where they are evaluated. Modules of a user's own bring their
+scales along, and so do networks with a prior of a given precision.
 """
 
 import dataclasses
@@ -22,6 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .coordinates import Shifts
+from .laws.properties import Property, raw
 from .objective import Objective
 from .program import weights_of
 
@@ -39,6 +41,7 @@ def in_ranges(
     chosen = {name: at for name, at in places.items() if at is not None}
     seen = objective.seen(objective.full(quiet)) if chosen else {}
     points = {name: seen[name][np.isfinite(seen[name]).all(axis=1)] for name in chosen}
+    points = {name: _asked(objective.system.neural[name], at) for name, at in points.items()}
     if not any(map(len, points.values())):
         return objective, start, start
     size, fresh, shifts = np.array(c.size), np.array(c.start), []
@@ -46,7 +49,7 @@ def in_ranges(
     ends = np.zeros(len(c), bool)  # weights of last layers
     for name, at in chosen.items():
         low, high = points[name].min(axis=0), points[name].max(axis=0)
-        net, centre = objective.system.neural[name], 0.5 * (low + high)
+        net, centre = raw(objective.system.neural[name]), 0.5 * (low + high)
         size[at], fresh[at] = _inner(net, centre, 0.5 * (high - low))
         ends[at] = _of_last_layer(net)
         if net.layers[0].bias is not None and is_centred:
@@ -61,7 +64,7 @@ def in_ranges(
     effects = np.zeros(len(c))
     effects[objective.free] = np.linalg.norm(weights.row[:, None] * found.jacobian, axis=0)
     for name, at in chosen.items():
-        net = objective.system.neural[name]
+        net = raw(objective.system.neural[name])
         out = _outer(net, _like(net, effects[at]).layers[-1], misfit)
         size[at], fresh[at] = size[at] * out, fresh[at] * out
     joined = Shifts(*(np.concatenate(parts) for parts in zip(*shifts, strict=True))) if shifts else None
@@ -73,11 +76,16 @@ def in_ranges(
 
 def _places(objective: Objective, name: str) -> Int[np.ndarray, " w"] | None:
     """The coordinates of a raw network whose prior the evidence chooses; None for all others."""
-    net, c = objective.system.neural[name], objective.coordinates
+    net, c = raw(objective.system.neural[name]), objective.coordinates
     if type(net) is not eqx.nn.MLP or len(net.layers) < 2 or objective.penalties.get(name) != "evidence":
         return None
     at = np.flatnonzero(np.array([group == name for group in c.group]) & c.is_weight)
     return at if objective.free[at].all() else None
+
+
+def _asked(net: Any, points: Float[np.ndarray, "m inputs"]) -> Float[np.ndarray, "n inputs"]:
+    """Where a raw network is evaluated for its law at these points."""
+    return net.asked(points) if isinstance(net, Property) and len(points) else points
 
 
 def _shifts(net: Any, at: Int[np.ndarray, " w"], centre: Float[np.ndarray, " inputs"]) -> Shifts:

@@ -15,7 +15,7 @@ from ..run.simulation.simulate import simulate
 from ..run.simulation.solution import Solution
 from ..run.system.system import AcausalSystem
 from .objective import Objective
-from .program import Runs, SensorLaw, Setting, placed, predict, run_end
+from .program import Runs, SensorLaw, Setting, delays_of, placed, predict, run_end, with_kinds
 
 
 def run(objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: np.ndarray | None = None) -> Solution:
@@ -23,7 +23,8 @@ def run(objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: n
     layout, s = objective.layout, objective.stacked
     shared, own = objective.numbers(objective.coordinates.natural(z))
     system, _, initial = placed(objective.setting, shared, own[experiment], objective.conditions.known[experiment])
-    inputs = {n: (t[experiment], v[experiment], dict(s.kinds)[n]) for n, (t, v) in s.inputs.items()}
+    samples = {n: (t[experiment], v[experiment]) for n, (t, v) in objective.conditions.inputs.items()}
+    inputs = with_kinds(samples, layout, delays_of(layout, shared))
     end = s.counts[experiment]
     times = s.times[experiment, :end] if ts is None else ts
     t0 = jnp.asarray(s.t0[experiment], objective.conditions.t0.dtype)
@@ -57,22 +58,28 @@ def residuals(
     objective: Objective,
     model: AcausalSystem,
     starts: Mapping[str, ArrayLike | Sequence[float]],
+    delay: Mapping[str, ArrayLike],
     observe: Mapping[str, SensorLaw],
     adjoint: PyTree,
 ) -> dict[str, dict[str, Array]]:
     """As `Problem.residuals`: predictions of a model like the objective's less its data, in units of the noise."""
     layout, s = objective.layout, objective.stacked
     shared, own = objective.numbers(objective.coordinates.start)
-    shared = shared[len(shared) - len(layout.shared) :]
+    first = len(layout.extra)
+    shared = shared[len(shared) - len(layout.shared) - first :]
+    for name, value in delay.items():
+        if name not in layout.delayed:
+            raise ModelError(f"delay: '{name}' has none in this problem: " + nearest(name, layout.delayed))
+        shared = shared.at[layout.delayed.index(name)].set(jnp.asarray(value, shared.dtype))
     for name, value in starts.items():
         value = jnp.asarray(value, shared.dtype)
         if name in layout.shared:
-            shared = shared.at[layout.shared.index(name)].set(value)
+            shared = shared.at[first + layout.shared.index(name)].set(value)
         elif name in layout.own:
             own = own.at[:, layout.own.index(name)].set(value)
         else:
             raise ModelError(f"the start of '{name}' is not unknown: " + nearest(name, layout.shared + layout.own))
-    plain = dataclasses.replace(layout, parameters=(), modules=(), extra=())
+    plain = dataclasses.replace(layout, parameters=(), modules=())
     setting = Setting(model, {**objective.observers, **observe}, plain, objective.setting.fine)
     outputs = predict(setting, Runs(adjoint), shared, own, objective.conditions).values
     sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)

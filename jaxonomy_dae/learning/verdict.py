@@ -55,7 +55,8 @@ def _judged(fit: "Estimate") -> tuple[Leftover, set[str]]:
         return left, set()
     named = {name for name, p in left.found.items() if p <= max(min(left.found.values()), SINGLE)}
     if "outliers" in named and left.outliers.any():
-        named = {name for name in named if left.without_outliers[name] <= SINGLE} | {"outliers"}
+        # A fit follows outliers: how large the noise is shows once they are left out.
+        named = {name for name in named & COLOURS if left.without_outliers[name] <= SINGLE} | {"outliers"}
     return left, named
 
 
@@ -93,11 +94,12 @@ def _elsewhere(fit: "Estimate") -> str:
 
 def _coloured(fit: "Estimate", left: Leftover) -> str:
     """What residuals look like, and what that speaks for."""
-    best, also = described(fit, left), _standing_out(fit, left)
-    clauses = [best.clause, *(clause for clause in also if "correlate" not in best.clause)]
+    found, also = described(fit, left), _standing_out(fit, left)
+    clauses = [found[0].clause, *(clause for clause in also if "correlate" not in found[0].clause)]
+    rivals = "".join(f"; or, hardly less likely, {one.clause}: {one.speaks}" for one in found[1:])
     return (
-        f"residuals are not white noise: {', '.join(clauses[:4])}. It may be that {best.speaks}. Until then "
-        "intervals are too narrow, those of fit.table(white=False) wider. Look at fit.plot_residuals()"
+        f"residuals are not white noise: {', '.join(clauses[:4])}. It may be that {found[0].speaks}{rivals}. Until "
+        "then intervals are too narrow, those of fit.table(white=False) wider. Look at fit.plot_residuals()"
     )
 
 

@@ -4,6 +4,7 @@ import ast
 import fnmatch
 import functools
 import graphlib
+import re
 from pathlib import Path
 
 import jaxonomy_dae
@@ -29,6 +30,7 @@ DEFERRED = {
 # for several modules.
 CLOSING = {
     ("run/system/system", "fmi/export"): "a method of a system writes it as an FMU",
+    ("run/system/system", "fmi/plain_c"): "a method of a system writes it as C code",
     ("run/simulation/solution", "run/simulation/energy_balance"): "the balance of a solution is that of a second run",
     ("learning/*", "learning/estimate"): "an estimate's methods call the modules that read it",
     ("learning/estimate", "learning/problem"): "a problem makes the estimates that know it",
@@ -126,3 +128,27 @@ def test_no_circle_but_those_that_are_listed():
     }
     list(graphlib.TopologicalSorter(opened).static_order())
     assert used == set(CLOSING), "listed, but no longer there"
+
+
+def test_the_core_is_what_its_page_says():
+    """Files exist, lengths are those given, and the whole can be read in a day."""
+    page = (ROOT.parent / "docs" / "core.md").read_text()
+    total = 0
+    for said, files in re.findall(r"^\| \*\*[^*]+\*\* \(([\d,]+)\) \|([^|]+)\|", page, re.M):
+        paths = [ROOT / path for path in re.findall(r"`([^`]+\.py)`", files)]
+        lines = sum(len(path.read_text().splitlines()) for path in paths)
+        assert abs(lines - int(said.replace(",", ""))) <= 0.05 * lines, f"{lines} lines, the page says {said}: {files}"
+        total += lines
+    assert 5_000 < total < 10_500
+
+
+def test_whether_a_value_is_known_is_asked_in_one_place():
+    """`host/staging.py` asks it; rooms that compute do not look at JAX' tracers themselves."""
+    asking = [
+        "/".join(name)
+        for name, tree in modules().items()
+        if name[0] in ("solve", "run", "learning", "analysis")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module == "jax.core" and "Tracer" in {a.name for a in node.names}
+    ]
+    assert not asking

@@ -37,7 +37,7 @@ def has(owner, name):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_attributes_exist(page):
-    called = set(re.findall(rf"(?<![\w.])({'|'.join(OWNERS)})\.([A-Za-z]\w*)", code(page))) - OTHER
+    called = set(re.findall(rf"(?<![\w./])({'|'.join(OWNERS)})\.([A-Za-z]\w*)", code(page))) - OTHER
     # In components of the pages, what they declare themselves is an attribute too.
     declared = set(re.findall(r'self\.\w+\("(\w+)"', code(page))) | set(re.findall(r"self\.(\w+) = ", code(page)))
     missing = [f"{o}.{n}" for o, n in called if not has(OWNERS[o], n) and not (o == "self" and n in declared)]

@@ -20,8 +20,8 @@ def size(request, monkeypatch):
     if request.param != "whole":
         monkeypatch.setattr(redundant_constraints, "WHOLE", 0)
         if request.param == "many":
-            monkeypatch.setattr(redundant_constraints, "LARGEST", 0)
-        monkeypatch.setattr(consistent_point, "FEW", 0)
+            monkeypatch.setattr(redundant_constraints, "DECOMPOSED_UPTO", 0)
+        monkeypatch.setattr(consistent_point, "DECOMPOSED_UPTO", 0)
 
 
 # --- joints side by side -------------------------------------------------------------------------------------------

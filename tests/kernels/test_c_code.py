@@ -28,6 +28,7 @@ UNARY = {
     "to_int64": lambda x: x.astype(jnp.int64), "to_uint8": lambda x: x.astype(jnp.uint8),
     "to_bool": lambda x: x.astype(bool), "cube": lambda x: lax.integer_pow(x, 3),
     "seventh": lambda x: lax.integer_pow(x, 7), "inverse_square": lambda x: lax.integer_pow(x, -2),
+    "fewer_digits": lambda x: lax.reduce_precision(x, jnp.finfo(x.dtype).nexp, 1),
 }  # fmt: skip
 BINARY = {
     "add": lax.add, "sub": lax.sub, "mul": lax.mul, "div": lax.div, "rem": lax.rem, "max": lax.max, "min": lax.min,

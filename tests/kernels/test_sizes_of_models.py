@@ -26,7 +26,7 @@ class TwoGuesses(Component):
 def test_guesses_share_whatever_the_size(monkeypatch):
     """Guesses that cannot all hold share what is open: the nearest point is x = y = 1.5. Of more than 600 quantities
     the first guess held, and y was 2, without a word."""
-    monkeypatch.setattr(rows, "DENSE_LIMIT", 0)
+    monkeypatch.setattr(rows, "DECOMPOSED_UPTO", 0)
     chosen = rows.initial_rows(compiled(TwoGuesses(EqnEnv(), "c", 3)).plan, ())
     assert [row.name for row in chosen.kept[-2:]] == ["c.x", "c.y"]
     assert chosen.n_soft == 2 and chosen.independent[-2:] == (True, False)
@@ -34,7 +34,7 @@ def test_guesses_share_whatever_the_size(monkeypatch):
 
 def test_guesses_of_models_too_large_to_share(monkeypatch):
     """Where the nearest point would take too long, the report says which guess gave way."""
-    monkeypatch.setattr(rows, "DENSE_LIMIT", 0)
+    monkeypatch.setattr(rows, "DECOMPOSED_UPTO", 0)
     monkeypatch.setattr(rows, "DENSE_UPTO", 0)
     (note,) = compiled(TwoGuesses(EqnEnv(), "c", 4)).initialization_report().notes
     assert "'c.y' gave way to those before" in note
@@ -75,6 +75,6 @@ def test_points_of_the_compiler(monkeypatch, e):
     plan = compiled(Nearly(EqnEnv(), "c", 3, e), state_selection="projection").plan
     declared, found = Declared(plan.flat.parameters.everything(np.array([e])), {}), []
     for few in (0, 10**6):
-        monkeypatch.setattr(consistent_point, "FEW", few)
+        monkeypatch.setattr(consistent_point, "DECOMPOSED_UPTO", few)
         found.append(initial_point(plan.model, declared).values)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-9)

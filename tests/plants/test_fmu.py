@@ -7,31 +7,22 @@ import threading
 import zipfile
 from pathlib import Path
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from cell_arrays import ladder
-from fmus import opened, problems, run
+from fmus import check_derivatives, compare, exported, opened, run
 from hybrid_models import Ball, Bob, Doubling, SampledPI, Stick, Thermostat
 from hybrid_models import compiled as hybrid
 from problems import compiled, drag_on, mlp, pendulum
 
-from jaxonomy_dae import Component, EqnEnv, der, simulate
+from jaxonomy_dae import Component, EqnEnv, der
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.fmi import export_fmu
 from jaxonomy_dae.fmi.compilers import FLAGS, compiler_for, this_platform
-from jaxonomy_dae.run.system.nonlinear import Refinement
 from jaxonomy_dae.write import Eq
 
 pytestmark = pytest.mark.skipif(compiler_for(this_platform()) is None, reason="no C compiler on this machine")
-
-
-def exported(system, folder, name="model", **options):
-    path = system.export_fmu(folder / f"{name}.fmu", **options)
-    assert problems(path) == []
-    return path
 
 
 class Robertson(Component):
@@ -126,9 +117,7 @@ def test_what_an_fmu_holds(ball, tmp_path):
     assert ball.stat().st_size < 100_000
     sources = tmp_path / "sources"
     command = [*(compiler_for(this_platform()) or ()), *FLAGS, "-Wall", "-Wextra", "-Werror", "-O0"]
-    done = subprocess.run(
-        [*command, "fmi3_model_exchange.c", "-o", "x.so", "-lm"], cwd=sources, capture_output=True, text=True
-    )
+    done = subprocess.run([*command, "fmi3.c", "-o", "x.so", "-lm"], cwd=sources, capture_output=True, text=True)
     assert not done.returncode, done.stderr
     symbols = subprocess.run(["nm", "-D", "--defined-only", "x.so"], cwd=sources, capture_output=True, text=True)
     assert symbols.stdout and all(line.split()[-1].startswith("fmi3") for line in symbols.stdout.splitlines())
@@ -216,60 +205,6 @@ def test_what_cannot_be_exported_is_refused_by_name(tmp_path, ball):
 # --- derivatives ----------------------------------------------------------------------------------------------------
 
 
-def point(system, fmu, outputs):
-    """Returns (names of unknowns, of knowns, values of knowns, the unknowns as a function of the knowns' values)."""
-    states = system.states
-    unknowns = [*(f"der({n})" for n in states), *outputs]
-    leaves, tree = jax.tree.flatten(eqx.filter(system.neural, eqx.is_inexact_array))
-    weights = [n for n in fmu.reference if n.startswith("drag.")]
-    parameters = [
-        v.name for v in fmu.description.modelVariables if v.causality == "parameter" and v.name not in weights
-    ]
-    inputs = system.inputs
-    knowns = ["time", *states, *inputs, *parameters, *weights]
-    values = [np.asarray(fmu.get(n) if n not in weights else None) for n in knowns if n not in weights]
-    values = [jnp.asarray(v[0]) for v in values] + leaves
-    n, m, k = len(states), len(inputs), len(parameters)
-
-    discrete = jnp.asarray([*(fmu.get(name)[0] for name in system.discretes)])
-    q = jnp.concatenate([discrete, system.discrete_values[len(discrete) :]])
-    guess = system.initialize()[n:]
-
-    def function(*given):
-        t, x, u = given[0], jnp.stack(given[1 : 1 + n]), given[1 + n : 1 + n + m]
-        p, w = given[1 + n + m : 1 + n + m + k], given[1 + n + m + k :]
-        own = system.with_parameters(dict(zip(parameters, p, strict=True)))
-        own = eqx.tree_at(lambda s: s.neural, own, eqx.combine(jax.tree.unflatten(tree, w), system.neural))
-        own, args = own.holding(q), dict(zip(inputs, u, strict=True))
-        if len(guess):
-            x = own.at(t, args).refined(jnp.concatenate([x, guess]), Refinement.ROOT)
-        return jnp.concatenate([own.vector_field(t, x, args)[:n], own.observe(outputs, t, x, args)])
-
-    return unknowns, knowns, values, function
-
-
-def check_derivatives(system, path, outputs, seed=0, rtol=1e-10):
-    """Both derivatives are those of JAX, and each other's transposes."""
-    rng = np.random.default_rng(seed)
-    with opened(path) as fmu:
-        unknowns, knowns, values, function = point(system, fmu, outputs)
-        along = [rng.normal(size=np.shape(v)) for v in values]
-        weight = rng.normal(size=len(unknowns))
-        value, slope = jax.jit(lambda v, a: jax.jvp(function, tuple(v), tuple(a)))(values, along)
-        back = jax.jit(lambda v, w: jax.vjp(function, *v)[1](w))(values, jnp.asarray(weight))
-        flat = np.concatenate([np.ravel(a) for a in along])
-        np.testing.assert_allclose(fmu.get(*unknowns), value, rtol=1e-11, atol=1e-11)
-        forward = fmu.forward(unknowns, knowns, flat)
-        scale = max(np.abs(slope).max(), 1e-300)
-        np.testing.assert_allclose(forward / scale, slope / scale, atol=rtol)
-        reverse = fmu.reverse(unknowns, knowns, weight, len(flat))
-        expected = np.concatenate([np.ravel(b) for b in back])
-        scale = max(np.abs(expected).max(), 1e-300)
-        np.testing.assert_allclose(reverse / scale, expected / scale, atol=rtol)
-        both = weight @ forward, reverse @ flat
-        assert abs(both[0] - both[1]) <= 1e-12 * max(np.abs(reverse * flat).sum(), np.abs(weight * forward).sum())
-
-
 def test_derivatives_through_an_implicit_equation(heated):
     """q + 0.1·q³ = air − wall: dq/dair = 1/(1 + 0.3·q²)."""
     with opened(heated) as fmu:
@@ -324,17 +259,6 @@ def test_other_starts_are_found_in_c(tmp_path):
     path = exported(swing(), tmp_path, outputs=["pend.lam"])
     with opened(path, {"pend.initial_theta": 0.3, "pend.L": 2.0}) as fmu:
         np.testing.assert_allclose(fmu.get("pend.x", "pend.y"), [2 * math.cos(0.3), 2 * math.sin(0.3)], atol=1e-12)
-
-
-def compare(system, path, t1, names, atol, inputs=None, **options):
-    """A run by CVode beside one by `simulate`, away from events."""
-    found = run(path, t1, names, rtol=1e-10, record_events=False, **options)
-    solution = simulate(
-        system, t1, rtol=1e-10, atol=1e-12, ts=jnp.asarray(np.clip(found["time"], 0, t1)), inputs=inputs
-    )
-    for name in names:
-        np.testing.assert_allclose(found[name], solution[name], atol=atol, err_msg=name)
-    return solution
 
 
 @pytest.mark.slow

@@ -5,8 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fmus import fmpy
-from hybrid_models import Ball
-from hybrid_models import compiled as hybrid
 from problems import compiled
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
@@ -65,9 +63,6 @@ def test_what_cannot_be_a_component_is_refused_by_name(decay, tmp_path):
         imported(decay, outputs=["d.z"])
     with pytest.raises(ModelError, match="f: 'd.x' is not a scalar parameter of the FMU"):
         imported(decay, parameters=["d.x"])
-    path = hybrid(Ball, "b").export_fmu(tmp_path / "ball.fmu", kinds=["model_exchange"], platforms=())
-    with pytest.raises(ModelError, match="'ball.fmu' has 1 event indicators, and events of an FMU are not run"):
-        imported(path)
     bare = compiled(Decay(EqnEnv(), "d")).export_fmu(tmp_path / "bare.fmu", kinds=["model_exchange"], platforms=())
     with pytest.raises(ModelError, match="has no binary for .*, only for none"):
         imported(bare)

@@ -1,5 +1,6 @@
 """The package's errors: their classes, and the words that messages share."""
 
+from .keywords import check_handed_on as check_handed_on
 from .keywords import explained as explained
 from .keywords import explained_keywords as explained_keywords
 from .keywords import keywords_of as keywords_of

@@ -2,7 +2,7 @@
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 from .kinds import ModelError
@@ -58,3 +58,14 @@ def wrong_keyword(where: str, name: str, known: list[str], elsewhere: Mapping[st
     """The text of an error about a keyword that a call does not have."""
     here = f"write {elsewhere[name]}" if name in elsewhere else nearest(name, known)
     return f"{where}: there is no argument '{name}': {here}"
+
+
+def check_handed_on(
+    where: str, given: Mapping[str, Any], to: Callable[..., Any], own: Sequence[str] = (), but: Sequence[str] = ()
+):
+    """Refuses keywords that a function `where` would hand on to another that does not have them. Its `own`
+    arguments are among the hints; those that it gives itself, `but`, are not."""
+    known = [name for name in dict.fromkeys([*own, *keywords_of(to)]) if name not in but]
+    for name in given:
+        if name not in known:
+            raise ModelError(wrong_keyword(where, name, known))

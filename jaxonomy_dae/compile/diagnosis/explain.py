@@ -10,11 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...base.tolerances import NO_PART, RANK
+from ...graph.judgement.rank import DECOMPOSED_UPTO
 from ..model.entries import Entries
 from ..model.tables import ZERO, AliasTable, FlatModel, equation_offsets, provenance_of
 from .wording import DomainWords, listed, words
-
-LARGEST = 400  # equations among which the smallest dependent set is sought
 
 
 class Explainer:
@@ -52,7 +51,7 @@ class Explainer:
     def _smallest(self, rows: np.ndarray, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Reduces equations that depend on each other to the smallest such set: the support of the left null vector.
         Entries that are not numbers are drawn at random."""
-        if not 1 < len(rows) <= LARGEST:
+        if not 1 < len(rows) <= DECOMPOSED_UPTO:
             return rows, variables
         matrix = np.zeros((len(rows), len(variables)))
         random = np.random.default_rng(0)

@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from ...base.tolerances import HALF_OF_THE_DIGITS, KNOWN, NO_PART, UNCHANGED
-from ...graph.judgement.rank import above_errors, rank_of
+from ...graph.judgement.rank import DECOMPOSED_UPTO, above_errors, rank_of
 from ...graph.judgement.scaling import equilibrated
 from ...solve.linear.sparse_least_squares import SparseLeastSquares
 from ..model.constraint_jacobian import (
@@ -42,10 +42,7 @@ from ..model.tables import ZERO, AliasTable, FlatModel, equation_offsets, proven
 from ..model.typical_sizes import typical_sizes
 from .wording import listed, words
 
-# Constraints whose singular values are computed, in some 0.2 s. Of more, the combinations that vanish are what least
-# squares leave of random ones.
-LARGEST = 600
-WHOLE = LARGEST  # constraints of a part in which those that depend on each other are not sought first
+WHOLE = DECOMPOSED_UPTO  # constraints of a part in which those that depend on each other are not sought first
 SAMPLES = 4  # random directions of a larger part that stand for all: what none of them sees has probability zero
 NO_SHARE = 1e-4  # of the largest, in a random vector for which uᵀG is zero to some six digits: no part of any such u
 MECHANICAL = ("Planar", "Translational", "Rotational")
@@ -134,7 +131,7 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
     matrix, bounds = map(matrix_of, _values_and_errors(at, entries))
     if not np.isfinite(matrix.data).all():
         return []
-    if sampled is None or len(rows) <= LARGEST:
+    if sampled is None or len(rows) <= DECOMPOSED_UPTO:
         rank = rank_of(matrix.toarray(), bounds.toarray())
         # Where it is constant, no point that is found decides.
         number = rank.number if entries.constant.all() else int((rank.s > HALF_OF_THE_DIGITS * rank.s[0]).sum())

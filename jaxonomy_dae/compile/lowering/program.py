@@ -12,7 +12,7 @@ import lineax as lx
 import numpy as np
 
 from ...base.aliases import Numeric
-from ...solve.linear.sparse import DENSE, SparsePattern
+from ...solve.linear.sparse import DENSE_UPTO, SparsePattern
 from ..model.tables import ZERO
 from .gather import Gather
 from .loops import Loop, find_loops
@@ -138,7 +138,7 @@ def plan(
     place[carried] = len(states) + np.arange(len(carried))
     next_chunk = 2
     planned = []
-    for step in merge_thin(find_loops(steps, n_quantities), n_quantities, DENSE):
+    for step in merge_thin(find_loops(steps, n_quantities), n_quantities, DENSE_UPTO):
         layout = Layout(chunk, offset)
         if isinstance(step, Loop):
             planned.append(_plan_loop(step, layout))

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ...base.tolerances import ILL_CONDITIONED
+from ...graph.judgement.rank import DECOMPOSED_UPTO
 from ...graph.judgement.scaling import equilibrated
 from ...solve.linear.newton import Tried, newton
 from ...solve.linear.sparse_least_squares import SparseLeastSquares
@@ -17,9 +18,6 @@ from .opaque import Networks
 from .quantities import ReducedModel
 from .tables import Declared
 
-# Quantities up to which singular values are computed, in some 0.05 s at 300. Beyond, one sparse factorization solves to
-# five digits, which steps that are repeated until the equations hold do not show.
-FEW = 300
 MOST = 240  # looks at a point, shortened steps included; Newton's method takes ten
 
 _Seen = tuple[
@@ -74,6 +72,8 @@ def consistent_point(extended: Extended, guess: Point, fixed: list[tuple[int, fl
 
 
 def _least_norm(matrix: Any, right: np.ndarray) -> np.ndarray:
-    if matrix.shape[1] <= FEW:
+    # Beyond, one sparse factorization solves to five digits, which steps that are repeated until the equations hold do
+    # not show.
+    if matrix.shape[1] <= DECOMPOSED_UPTO:
         return np.linalg.lstsq(matrix.toarray(), right, rcond=1 / ILL_CONDITIONED)[0]
     return SparseLeastSquares(matrix).solve(right)

@@ -16,13 +16,12 @@ import scipy.sparse as sp
 
 from ...base.tolerances import CANCELLED, KNOWN, NO_WEIGHT
 from ...graph.expressions.node import Number
-from ...graph.judgement.rank import above_errors, rank_of
+from ...graph.judgement.rank import DECOMPOSED_UPTO, above_errors, rank_of
 from ...graph.judgement.sparse_rank import sparse_rank_of
 from . import elimination
 from .elimination import Row
 from .rounded import Rounded
 
-DENSE = 200  # equations of a block up to which singular values are computed, in some 0.1 s
 REFINEMENTS = 2  # set by hand
 LARGEST_DENOMINATOR = 1000  # of a fraction that a computed weight is taken for
 SIMPLE = 1_000_000  # numerator times denominator: beyond, fractions come as near to any number by chance
@@ -73,7 +72,7 @@ class BlockMatrix:
 
 def null_vectors(matrix: BlockMatrix) -> list[Row]:
     """Vectors w with wᵀA = 0 for the matrix A, by number of the row; fewest entries first."""
-    if matrix.shape[0] <= DENSE:
+    if matrix.shape[0] <= DECOMPOSED_UPTO:
         return [
             dict(zip(np.flatnonzero(w).tolist(), w[w != 0].tolist(), strict=True))
             for w in left_null_vectors(*(part.toarray() for part in matrix.sparse()))

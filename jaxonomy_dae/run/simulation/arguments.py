@@ -14,12 +14,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from ...base.aliases import Controller, Inputs, PyTree, Result, Solver, Time, Times
 from ...base.errors import ModelError
 from ...base.tolerances import RESOLUTION
+from ...host.staging import is_traced
 from ...solve.adjoint.resting import still
 from ...solve.methods.solve_arguments import check_finite, check_longest_step
 from ..start.initial_values import check_initial
@@ -126,7 +126,7 @@ def check_switches(max_events: Any, **switches: object) -> None:
 
 
 def _told(value: object) -> str:
-    if isinstance(value, Tracer):
+    if is_traced(value):
         return "a traced value, which is not known when the program is made: give it from outside of jit, grad and vmap"
     return repr(value)
 
@@ -148,7 +148,7 @@ def _check_periods(system: AcausalSystem):
 
 
 def _concrete(value: object) -> np.ndarray | None:
-    return None if isinstance(value, Tracer) else np.asarray(value, float)
+    return None if is_traced(value) else np.asarray(value, float)
 
 
 def _check_length(t0: float, t1: float, dtype: np.dtype) -> None:
@@ -174,7 +174,7 @@ def _check_interval(t0, t1, ts, dtype):
         return
     if np.ndim(ts) != 1 or not np.shape(ts)[0]:
         raise ModelError(f"ts must have shape (n,), n ≥ 1; got {np.shape(ts)}")
-    if not isinstance(ts, Tracer) and np.asarray(ts).dtype.kind not in "biuf":
+    if not is_traced(ts) and np.asarray(ts).dtype.kind not in "biuf":
         raise ModelError(f"ts must be numbers; got {np.asarray(ts).dtype}")
     saved = _concrete(ts)
     if saved is None:

@@ -7,13 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from ...base.aliases import Args, Numeric, PyTree, Times
 from ...base.errors import ModelError
-from ...host.staging import on_device
+from ...host.staging import is_traced, on_device
 from ...solve.events.problem import HybridState
 from ..system.system import AcausalSystem
 
@@ -82,7 +81,7 @@ class Events:
     @property
     def count(self) -> int | Int[Array, "*batch"]:
         count = self._log.count
-        one = not isinstance(count, Tracer) and not count.ndim
+        one = not is_traced(count) and not count.ndim
         return int(count) if one else count.astype(int)
 
     @property
@@ -108,7 +107,7 @@ class Events:
         return Side(self._log.ts, self._log.after, self._system, self._inputs)
 
     def _numbers(self) -> list[int]:
-        if isinstance(self.which, Tracer) or self.which.ndim != 1:
+        if is_traced(self.which) or self.which.ndim != 1:
             raise ModelError("the names of events are those of one run, outside jit: read .which and .all_names")
         return [int(k) for k in np.asarray(self.which) if k >= 0]
 

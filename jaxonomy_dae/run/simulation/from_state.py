@@ -4,11 +4,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ...base.aliases import Args, PyTree, Time
 from ...base.errors import InitializationError, ModelError
+from ...host.staging import is_traced
 from ...write.events import EventFlag
 from ..start.initialize import InitialPoint, is_consistent
 from ..system.system import AcausalSystem
@@ -57,7 +57,7 @@ def check_array(system: AcausalSystem, initial: PyTree) -> None:
         )
     if not jnp.issubdtype(jnp.result_type(initial), jnp.number) or jnp.iscomplexobj(initial):
         raise ModelError(f"initial: a state consists of real numbers; got {jnp.result_type(initial)}")
-    if not isinstance(initial, Tracer) and not np.isfinite(np.asarray(initial, float)).all():
+    if not is_traced(initial) and not np.isfinite(np.asarray(initial, float)).all():
         k = int(np.flatnonzero(~np.isfinite(np.asarray(initial, float)))[0])
         raise ModelError(f"initial: entry {k} of the state is {float(initial[k])}; entries must be finite")
 

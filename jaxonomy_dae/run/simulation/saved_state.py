@@ -4,14 +4,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ...base.aliases import Numeric, Time, Times
 from ...base.errors import ModelError
 from ...base.tolerances import KNOWN_ROUNDINGS
 from ...compile.diagnosis.wording import some
-from ...host.staging import picked
+from ...host.staging import is_traced, picked
 from ...solve.events.problem import AbstractHybridProblem
 from ...solve.events.start import Resumed
 from ...solve.methods.rows import padded
@@ -110,10 +109,10 @@ def check_saved_state(system: AcausalSystem, t0: Time, state: SavedState) -> Non
             + (f" and {some(list(system.discretes))}" if len(system.discretes) else "")
             + ". Give initial={'component.variable': value, …} for what is to be taken over"
         )
-    finite = [part for part in (state.t, state.x, state.discrete) if not isinstance(part, Tracer)]
+    finite = [part for part in (state.t, state.x, state.discrete) if not is_traced(part)]
     if not all(np.isfinite(np.asarray(part)).all() for part in finite):
         raise ModelError("initial: this state has entries that are not finite: the run that it is of did not get there")
-    if t0 is None or isinstance(t0, Tracer) or isinstance(state.t, Tracer):
+    if t0 is None or is_traced(t0) or is_traced(state.t):
         return
     known = np.abs(np.asarray(t0, state.x.dtype) - np.asarray(state.t))
     if not known <= KNOWN_ROUNDINGS * np.finfo(state.x.dtype).eps * np.abs(np.asarray(state.t)):

@@ -1,6 +1,7 @@
 """`simulate`: a compiled system integrated by Diffrax."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ from ...base.errors import InitializationError, ModelError, SimulationError, exp
 from ...host.cache import PROGRAMS
 from ...host.members import batch_size, is_batched, say_of_members
 from ...host.rows import filled_up
-from ...host.staging import as_argument, as_array, is_forwards, is_staged, is_traced, picked
+from ...host.staging import as_argument, as_array, is_forwards, is_staged, is_traced, on_device, picked
 from ...solve.adjoint.stored_adjoint import default_adjoint
 from ...solve.methods import BDF, Rodas5P, Tsit5
 from ...solve.methods.causes import decay_at, is_stiff
@@ -25,7 +26,7 @@ from ...solve.methods.failures import Stopped
 from ...solve.methods.solve import check_tolerances, default_tolerances
 from ...solve.methods.solve_arguments import jump_times
 from ...solve.methods.switching import BOUNDARY, MANY, SHARE, Watch
-from ..start.check import check
+from ..start.check import check, warn_of_outranked
 from ..start.initialize import InitialPoint, known_start, search_outside
 from ..start.ladder import Found
 from ..system.input_values import check_given
@@ -232,7 +233,7 @@ def _given(system: AcausalSystem, t0: Time, t1: Time, ts: Times, inputs: Args, i
     if initial is None or isinstance(initial, Mapping):
         initial = {name: as_argument(v, dtype) for name, v in sorted((initial or {}).items())}
     else:
-        initial = jax.tree.map(lambda part: as_argument(part, dtype), initial)
+        initial = jax.tree.map(lambda part: on_device(part, dtype), initial)
     t0, t1 = as_argument(t0, dtype), as_argument(t1, dtype)
     if ts is not None:
         ts = as_argument(ts, dtype)
@@ -274,7 +275,7 @@ class _Call:
         """The largest numbers of steps and of events."""
         return self.asked.max_steps, MOST_EVENTS if self.max_events is None else self.max_events
 
-    @property
+    @functools.cached_property
     def run_by(self) -> Solver:
         """The solver of a run."""
         return SOLVERS[self.choice.solver]() if self.solver is None else self.solver
@@ -330,6 +331,8 @@ class _Call:
     def in_program(self, staged: bool) -> Solution:
         """The solution where values cannot be read."""
         checked, has_events = self.throw is True, self.system.plan.events is not None
+        if self.throw is not False and isinstance(self.given.initial, Mapping):
+            warn_of_outranked(self.system, self.given.initial, (), stacklevel=5)
         if staged:
             PROGRAMS.make_room()
             outcome = run(self.given, self.options(), self.watch(True), checked, self.begun)
@@ -342,7 +345,7 @@ class _Call:
                 say_of_members(number, texts, "runs that stopped", hint, self.throw, stacklevel=5)
                 checked = False
         x = raised(outcome.x, outcome.result, has_events, *self.bounds) if checked else outcome.x
-        return self._solution(outcome, outcome.stats, (outcome.ts, x, outcome.discrete), outcome.memory)
+        return self._solution(outcome, outcome.stats, (jnp.asarray(outcome.ts), x, outcome.discrete), outcome.memory)
 
     def outside(self) -> Solution:
         """The solution where values are known. Runs are repeated with an implicit solver, or with more room for events,
@@ -358,7 +361,7 @@ class _Call:
         if self.throw is not False:
             check_parameters(system)
             if isinstance(given.initial, Mapping):
-                check(system, outcome.found, given.t0, given.inputs, given.initial)
+                check(system, outcome.found, given.t0, given.inputs, given.initial, stacklevel=4)
             else:
                 check_state(outcome.found)
         if self.switches and self._is_stiff(outcome):

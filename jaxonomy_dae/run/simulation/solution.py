@@ -11,7 +11,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ...base.aliases import Numeric, Result, Solver, Time, Times, Tolerance
@@ -102,15 +101,15 @@ class Solution(eqx.Module):
         - `ModelError` if there is no such row, or the run did not reach it.
         """
         n = self.ts.shape[-1]
-        if not isinstance(k, Tracer) and not -n <= int(k) < n:
+        if not is_traced(k) and not -n <= int(k) < n:
             raise ModelError(f"solution.at({int(k)}): there are {n} saved times")
 
         def cut(rows: Numeric, place: Numeric) -> Numeric:
-            return rows[place] if isinstance(k, Tracer) else picked(rows, place)
+            return rows[place] if is_traced(k) else picked(rows, place)
 
         row = (..., k, slice(None))
         t, x, none = cut(self.ts, (..., k)), cut(self.states, row), cut(self.states, (..., k, slice(0)))
-        if not isinstance(x, Tracer) and x.ndim == 1 and not np.isfinite(x).all():
+        if not is_traced(x) and x.ndim == 1 and not np.isfinite(x).all():
             raise ModelError(f"solution.at({int(k)}): the run did not get to t={float(t):g} ({self.result})")
         of = self.system.plan.digest_of_states
         if self.discrete is None or self.memory is None:

@@ -11,10 +11,9 @@ import scipy.sparse as sp
 from ...base.tolerances import KNOWN, RANK
 from ...compile.lowering.schedule import AnyStep, SparseStep
 from ...compile.model.group import Point, QuantityGroup
-from ...graph.judgement.rank import Rank, are_evident, rank_of
+from ...graph.judgement.rank import DECOMPOSED_UPTO, Rank, are_evident, rank_of
 from ...graph.judgement.sparse_rank import SparseRank, sparse_rank_of
 
-DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
 MOVED = 1e-3  # of what a Jacobian depends on, relative, to see whether it makes the Jacobian regular
 
 
@@ -94,7 +93,7 @@ class Block:
         matrix, errors = self.jacobian(known), self.matrix(lambda g: g.partial_errors(known.at, known.errors))
         if not np.isfinite(matrix.data).all():
             return None
-        if matrix.shape[0] > DENSE_LIMIT:
+        if matrix.shape[0] > DECOMPOSED_UPTO:
             return sparse_rank_of(matrix, errors)
         return rank_of(matrix.toarray(), errors.toarray())
 

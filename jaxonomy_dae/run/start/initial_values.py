@@ -5,9 +5,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from ...base.errors import ModelError
+from ...host.staging import is_traced
 from ...write.real_number import is_unknown_to_jax
 
 
@@ -26,9 +26,9 @@ def check_initial(system: Any, initial: Any) -> None:
             raise ModelError(f"initial: '{name}' needs a scalar; got {found}{hint}")
         if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
             raise ModelError(f"initial: '{name}' must be real; got {jnp.result_type(value)}")
-        if not isinstance(value, Tracer) and not np.isfinite(np.asarray(value, float)):
+        if not is_traced(value) and not np.isfinite(np.asarray(value, float)):
             raise ModelError(f"initial: '{name}' must be finite; got {value}")
         is_zero = system.plan.resolve([name])[0][0] < 0
-        if is_zero and not isinstance(value, Tracer) and float(value) != 0.0:
+        if is_zero and not is_traced(value) and float(value) != 0.0:
             found = f"{float(value):g}"
             raise ModelError(f"initial: '{name}' is identically zero in this model; got {found}. Leave it out")

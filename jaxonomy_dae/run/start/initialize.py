@@ -15,7 +15,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from ...base.errors import ModelError
 from ...base.tolerances import solved
@@ -195,7 +194,7 @@ def search_outside(
     None where values are not known, as inside jit, and where the search is another one."""
     plan, system = system.plan, system.without_stiffness
     system, t0, inputs, initial = known = jax.tree.map(
-        lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, Tracer) else leaf, (system, t0, inputs, initial)
+        lambda leaf: jax.lax.stop_gradient(leaf) if is_traced(leaf) else leaf, (system, t0, inputs, initial)
     )
     if is_traced(known):
         return None
@@ -230,6 +229,17 @@ def search_outside(
             start = guessed_from(plan, rows, look_at_all, start, first.typical)
         root = find_root(look, m, start, first.sizes, core, soft=soft, bounds=bounds, typical=first.typical)
     return jax.tree.map(as_argument, root)
+
+
+def slopes_at_guess(
+    system: Any, t0: Any, inputs: Any, initial: Mapping[str, Any], solve_for: tuple[str, ...] = ()
+) -> np.ndarray:
+    """The Jacobian of the rows where a search outside of programs begins."""
+    n = system.plan.n_state + len(solve_for)
+    nowhere = np.full(n, np.nan, system.parameters.values.dtype)
+    return jax.device_get(
+        _compiled_look(system.without_stiffness, t0, inputs, initial, solve_for, nowhere)
+    ).rows.jacobian
 
 
 def known_start(system: Any, t0: Any, inputs: Any, initial: Mapping[str, Any] | None) -> InitialPoint | None:
@@ -350,7 +360,7 @@ def is_consistent(found: InitialPoint) -> Any:
     """True if all rows hold, to rounding."""
     # What is not traced is compared by NumPy: each operation by itself would be a program to compile.
     parts: Any = (found.residual, found.limit, found.x, found.solved)
-    traced = any(isinstance(part, Tracer) for part in parts)
+    traced = is_traced(parts)
     xp: Any = jnp if traced else np
     residual, limit, x, solved = parts if traced else map(np.asarray, parts)
     return xp.all(xp.abs(residual) <= limit) & xp.all(xp.isfinite(xp.append(x, solved)))

@@ -30,17 +30,13 @@ from ...compile.model.opaque import Networks
 from ...compile.model.quantities import ABSENT
 from ...compile.model.starts import Start
 from ...compile.model.tables import ZERO, complete
-from ...graph.judgement.rank import above_errors
+from ...graph.judgement.rank import DECOMPOSED_UPTO, above_errors
 from ...graph.judgement.scaling import balanced, equilibrated
 from ...graph.judgement.sparse_rank import sparse_rank_of
 from ...graph.structure.dulmage_mendelsohn import left_open
 from ...graph.structure.matching import match_in_order
 from ...solve.linear.choice import DENSE_UPTO
 from .integrated import integrated
-
-# Quantities up to which one orthogonal factorization ranks all rows. Above, rows are matched with quantities, and then
-# judged by sparse factorizations: the verdicts are the same (tests/compiler/test_many_starts.py).
-DENSE_LIMIT = 600
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +61,7 @@ class InitialRows:
     direct: bool  # every kept row is a state and nothing else constrains the states
     redundant: tuple[int, ...]  # rows that must hold, though they follow from others
     settled: tuple[int, ...]  # of these, rows that follow from equations alone: no unknown moves them
-    dropped: tuple[str, ...]  # fixed starts that values given by the caller outrank
+    dropped: tuple[StartRow, ...]  # fixed starts that values given by the caller outrank
     unshared: tuple[
         str, ...
     ] = ()  # guesses that gave way to others, where there are too many unknowns for a compromise
@@ -152,7 +148,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
             settled=(), dropped=(),
         )  # fmt: skip
     generic = _generic(plan, solve_for)
-    judge = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
+    judge = _by_rank if generic.jacobian.shape[1] <= DECOMPOSED_UPTO else _by_matching
     closes, follows, soft, unshared, hints = judge(plan, generic, rows, ranks or _ranks(plan, guess, others))
     # What the caller gave outranks other starts, unless these follow whatever is given.
     is_dropped = [
@@ -167,7 +163,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
         direct=False,
         redundant=tuple(place for place, k in enumerate(kept) if not closes[k]),
         settled=tuple(place for place, k in enumerate(kept) if follows[k]),
-        dropped=tuple(row.name for row, gone in zip(rows, is_dropped, strict=True) if gone),
+        dropped=tuple(row for row, gone in zip(rows, is_dropped, strict=True) if gone),
         unshared=unshared,
         hints=hints,
     )
@@ -207,7 +203,7 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     size = declared_scale(plan.model)
     n_parameters = len(plan.flat.parameters)
     parameter_size = np.ones(n_parameters)
-    if n <= DENSE_LIMIT:  # parameters, as generic numbers, would make some equations stiff beside others
+    if n <= DECOMPOSED_UPTO:  # parameters, as generic numbers, would make some equations stiff beside others
         none = np.zeros(n_parameters)
         size, parameter_size = natural_sizes(extended.groups, extended.n_equations, size, none, by_terms=True)
     else:
@@ -218,7 +214,7 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     if solve_for:
         jacobian = sp.hstack([jacobian, sp.csr_array(_parameter_columns(plan, point, values, solve_for))], format="csr")
     # Directions that are open must not look closed because of units. Beyond the limit only the pattern is read.
-    scales = balanced if n + len(solve_for) <= DENSE_LIMIT else equilibrated
+    scales = balanced if n + len(solve_for) <= DECOMPOSED_UPTO else equilibrated
     scaled, rows, columns = scales(jacobian)
     known: Any = sp.csr_array(sp.diags_array(rows) @ errors @ sp.diags_array(columns[:n]))
     noise = np.hypot(np.linalg.norm(known.data), KNOWN * np.linalg.norm(scaled.data))
@@ -477,7 +473,7 @@ def supports(
     generic = _generic(plan, solve_for)
     hard = len(rows.kept) - rows.n_soft
     base = [r for r, alone in zip(rows.kept[:hard], rows.independent[:hard], strict=True) if alone]
-    if generic.jacobian.shape[1] <= DENSE_LIMIT:
+    if generic.jacobian.shape[1] <= DECOMPOSED_UPTO:
         return {k: _support(generic, rows.kept[k], base)[0] for k in rows.redundant}
     alone = [r for r, alone in zip(rows.kept, rows.independent, strict=True) if alone]
     matrix: Any = sp.csr_array(sp.vstack([generic.jacobian, generic.rows(alone)]))

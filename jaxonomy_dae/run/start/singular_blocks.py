@@ -18,9 +18,9 @@ from ...compile.model.group import Point, QuantityGroup
 from ...compile.model.opaque import Networks
 from ...compile.model.tables import ZERO
 from ...compile.model.typical_sizes import typical_sizes
-from ...graph.judgement.rank import Rank, are_evident, is_undecided
+from ...graph.judgement.rank import DECOMPOSED_UPTO, Rank, are_evident, is_undecided
 from ...graph.judgement.sparse_rank import SparseRank
-from .block_matrix import DENSE_LIMIT, Block, Known, blocks_of
+from .block_matrix import Block, Known, blocks_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,7 +187,7 @@ def _finding(plan: SystemPlan, known: Known, block: Block, rank: Rank | SparseRa
     equations = [text for text, size in zip(texts, left, strict=True) if size > SLIGHT * left.max()]
     causes = _causes(plan, known, block, rank) if left.any() else ()
     singular, n = not rank.is_regular, len(names)
-    undecided = singular and n <= DENSE_LIMIT and is_undecided(block.jacobian(known).toarray())
+    undecided = singular and n <= DECOMPOSED_UPTO and is_undecided(block.jacobian(known).toarray())
     return BlockFinding(
         condition=rank.condition if rank.is_regular else np.inf, singular=singular, size=n,
         variables=tuple(variables) or tuple(names), equations=tuple(dict.fromkeys(equations or texts)),
@@ -200,7 +200,7 @@ def _causes(plan: SystemPlan, known: Known, block: Block, rank: Rank | SparseRan
     """The parameters, or else the variables, a change of which makes the block regular."""
     parameters, names = known.at.parameters, plan.flat.parameters.names
     changing = np.flatnonzero(block.effects(known, rank, of_parameters=True).matters).tolist()
-    found = [(names[p], float(parameters[p])) for p in changing[:DENSE_LIMIT]]
+    found = [(names[p], float(parameters[p])) for p in changing[:DECOMPOSED_UPTO]]
     # A parameter that is not zero only scales what is: the cause is what is zero.
     zero = [c for c in found if c[1] == 0.0]
     if zero:
@@ -221,7 +221,7 @@ def _constraint_block(plan: SystemPlan) -> Block:
 def _constraints(plan: SystemPlan, known: Known) -> Iterator[BlockFinding]:
     """Hidden constraints that depend on each other at the state: the projection could not tell them apart."""
     m, values, groups = plan.n_constraints, known.at.values, tuple(planned.equation for planned in plan.constraints)
-    if not m or plan.constraint_pattern is None or m > DENSE_LIMIT:
+    if not m or plan.constraint_pattern is None or m > DECOMPOSED_UPTO:
         return
     if any(np.isnan(values[group.quantity]).any() or group.template.opaque is not None for group in groups):
         return

@@ -16,11 +16,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from ...base.private_names import private
 from ...host.content import Content, Hidden, content
 from ...host.libraries import Owner, owner
+from ...host.staging import is_traced
 
 # Parameters of JAX's calls of functions with rules of their own for derivatives that hold the rules.
 RULES = ("jvp_jaxpr_fun", "fwd_jaxpr_thunk", "bwd", "out_trees")
@@ -108,7 +108,7 @@ def _with_numbers_lifted(jaxpr: Any) -> tuple[Any, list[Any]]:
 
 def _own(value: Any) -> Any:
     """A copy: NumPy arrays may be written to later, and JAX may share their memory."""
-    return value if isinstance(value, Tracer) else jnp.array(value, copy=True)
+    return value if is_traced(value) else jnp.array(value, copy=True)
 
 
 def _is_data(literal: Any) -> bool:
@@ -178,7 +178,7 @@ def _key(value: Any, inside: tuple[Hashable, ...] = ()) -> Hashable:
         return type(value).__name__, tuple(_key(v, inside) for v in value)
     if isinstance(value, dict):
         return tuple((k, _key(v, inside)) for k, v in sorted(value.items()))
-    if isinstance(value, Tracer):
+    if is_traced(value):
         return _Same(value)
     if isinstance(value, np.ndarray | np.generic | jax.Array) or hasattr(value, "__array__"):
         array = np.asarray(value)

@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from ...base.errors import ModelError, nearest
@@ -150,7 +149,7 @@ def _constants(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any
     array = value if isinstance(value, jax.Array) else as_array(value)
     if array.dtype.kind not in "biuf":
         raise ModelError(f"inputs: '{name}' must be real numbers; got {array.dtype}")
-    if not isinstance(array, Tracer) and not np.isfinite(array).all():
+    if not is_traced(array) and not np.isfinite(array).all():
         index = tuple(np.argwhere(~np.isfinite(np.asarray(array)))[0].tolist())
         raise ModelError(f"input '{name}' must be finite; its entry {list(index)} is {array[index]}")
     return on_device(array, dtype)
@@ -177,7 +176,7 @@ def _constant(name: str, value: Any, dtype: Any) -> Any:
         raise ModelError(
             f"input '{name}' must be real; got {array.dtype}: give jnp.real(…) and jnp.imag(…) as two inputs"
         )
-    if not isinstance(array, Tracer) and not np.isfinite(array):
+    if not is_traced(array) and not np.isfinite(array):
         raise ModelError(f"input '{name}' must be finite; got {array}")
     return on_device(array, dtype)
 
@@ -220,6 +219,11 @@ def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: t
     if times.shape[0] < least:
         raise ModelError(f"input '{name}': {kind} samples are at least {least}; got {times.shape[0]}")
     _check_times(name, times)
+    return interpolated(times, values, kind)
+
+
+def interpolated(times: Float[Array, " n"], values: Float[Array, " n *shape"], kind: str) -> SampledInput:
+    """Samples as an input of a kind."""
     if kind == "held":
         return SampledInput(HeldPath(times, values), -1)
     if kind == "linear":
@@ -240,7 +244,7 @@ def _column(name: str, which: str, values: Any, dtype: Any, shape: tuple[int, ..
         raise ModelError(
             f"input '{name}': {which} must be real numbers of shape {wanted}; got {array.dtype} of shape {array.shape}"
         )
-    if not isinstance(array, Tracer) and not np.isfinite(array).all():
+    if not is_traced(array) and not np.isfinite(array).all():
         index = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
         where = ", ".join(map(str, index))
         raise ModelError(f"input '{name}': {which}[{where}] is {array[index]}; leave the sample out")
@@ -248,7 +252,7 @@ def _column(name: str, which: str, values: Any, dtype: Any, shape: tuple[int, ..
 
 
 def _check_times(name: str, times: Any):
-    if isinstance(times, Tracer):
+    if is_traced(times):
         return
     found = np.flatnonzero(~(np.diff(np.asarray(times, float)) > 0))
     if len(found):
@@ -266,7 +270,7 @@ def _interpolation(name: str, path: Any, shape: tuple[int, ...]) -> SampledInput
         either = f" or {('n', *shape)}".replace("'", "") if shape else ""
         raise ModelError(f"input '{name}' needs an interpolation of values of shape (n,){either}; it returns {shapes}")
     for leaf in jax.tree.leaves(path):
-        if not isinstance(leaf, Tracer) and not np.isfinite(np.asarray(leaf)).all():
+        if not is_traced(leaf) and not np.isfinite(np.asarray(leaf)).all():
             raise ModelError(
                 f"input '{name}': a value of {type(path).__name__} is not finite: leave the sample out, or fill it "
                 "with diffrax.linear_interpolation"
@@ -280,10 +284,10 @@ SLACK = 1e-6  # of the interval: by how much samples may miss its ends, which ar
 
 def check_range(inputs: Mapping[str, Any], t0: Any, t1: Any):
     """Raises a `ModelError` if samples do not reach over the interval; held ones may end before it does."""
-    if isinstance(t0, Tracer) or isinstance(t1, Tracer):
+    if is_traced((t0, t1)):
         return
     for name, value in inputs.items():
-        if not isinstance(value, SampledInput) or isinstance(value.path.ts, Tracer):
+        if not isinstance(value, SampledInput) or is_traced(value.path.ts):
             continue
         first, last = float(value.path.ts[0]), float(value.path.ts[-1])
         if not _reach_over(value, float(t0), float(t1), last - first if t0 == t1 else t1 - t0):

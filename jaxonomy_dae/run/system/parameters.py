@@ -9,7 +9,6 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from ...base.errors import ModelError, nearest
@@ -176,7 +175,7 @@ class Parameters(eqx.Module):
     def _as_given(self) -> Float[np.ndarray, "*batch n"] | None:
         """All values as they are given, not as they are read, outside jit; None of what holds only some of them."""
         parts = [self.values, self.free] if self.free_index else [self.values]
-        if not all(_is_array(part) and not isinstance(part, Tracer) for part in parts):
+        if not all(_is_array(part) and not is_traced(part) for part in parts):
             return None
         values = np.array(self.values)
         if self.free_index:
@@ -324,7 +323,7 @@ class Parameters(eqx.Module):
             )
         if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
             raise ModelError(f"{where} must be a real number; got the complex number {value}")
-        if isinstance(value, Tracer):
+        if is_traced(value):
             return value
         numbers = np.array([real_number(number, where) for number in np.ravel(np.asarray(value))])
         self.table.check(np.array(k), numbers)
@@ -338,7 +337,7 @@ class Parameters(eqx.Module):
             raise ModelError(f"{where} is an array of shape {entries.shape}: give a number or that shape; got {found}")
         if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
             raise ModelError(f"{where} must be real; got {jnp.result_type(value)}")
-        if isinstance(value, Tracer):
+        if is_traced(value):
             return value
         self.table.check(entries, np.asarray(value, np.float64))
         return value
@@ -384,11 +383,11 @@ def _with_values(table: ParameterNames, array: Any, given: Mapping[str, Any]) ->
     """All values with those given, where some are traced: what is out of its bounds becomes not-a-number."""
     for name, entries in table.chosen(given).items():
         value = jnp.asarray(given[name], array.dtype)
-        if isinstance(value, Tracer):
+        if is_traced(value):
             value = _inside(value, table.ends.take(entries))
         array = array.at[..., entries].set(value)
     array = complete(table.dependents, array)
-    if isinstance(array, Tracer):
+    if is_traced(array):
         chosen = np.array(list(table.expressions), np.int64)
         ends = table.ends.take(chosen)
         array = array if ends.are_none else array.at[..., chosen].set(_inside(array[..., chosen], ends))
@@ -417,7 +416,7 @@ def _is_array(leaf: Any) -> bool:
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, Tracer):
+    if is_traced(value):
         return str(value)
     return f"{float(value):g}" if np.ndim(value) == 0 else np.array2string(np.asarray(value), threshold=6, precision=6)
 

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ...base.aliases import Time
@@ -124,7 +123,7 @@ class AcausalSystem(eqx.Module):
     @property
     def without_stiffness(self) -> "AcausalSystem":
         """The same for programs that choose no solver, which models share though one is stiffer than the other."""
-        return dataclasses.replace(self, stiffness=None)
+        return self if self.stiffness is None else dataclasses.replace(self, stiffness=None)
 
     # --- changing ----------------------------------------------------------------------------------------------
 
@@ -147,7 +146,7 @@ class AcausalSystem(eqx.Module):
     def _sizes_at(self, parameters: Parameters) -> Float[Array, "*batch quantities"]:
         """Typical sizes at other parameter values; the present ones where these are not known, or a batch."""
         known, plan = parameters.known, self.plan
-        if known is None or isinstance(self.typical_sizes, Tracer):
+        if known is None or is_traced(self.typical_sizes):
             return self.typical_sizes
         sizes = typical_sizes(plan.model, plan.flat.parameters.everything(known))
         with jax.ensure_compile_time_eval():
@@ -182,7 +181,7 @@ class AcausalSystem(eqx.Module):
         out: dict[str, Any] = {n: eqx.filter(self.neural[n], eqx.is_inexact_array) for n in names if n in self.neural}
         for name, entries in chosen.items():
             z = out[name] = unconstrained(self.parameters[name], table.ends.take(entries))
-            if not isinstance(z, Tracer) and not np.isfinite(z).all():
+            if not is_traced(z) and not np.isfinite(z).all():
                 places = np.broadcast_to(entries, np.shape(z))[~np.isfinite(z)]
                 one, interval = table.names[places[0]], table.intervals[places[0]]
                 raise ModelError(
@@ -516,7 +515,7 @@ class AcausalSystem(eqx.Module):
         check_range(inputs, t0, t0)
         initial = self.plan.one_by_one(initial)
         found = find_initial(self, t0, inputs, initial, names, solver)
-        found = check(self, found, t0, inputs, initial, names, throw=throw)
+        found = check(self, found, t0, inputs, initial, names, throw=throw, stacklevel=3)
         if solve_for is None:
             return found.x
         table = self.parameters.table
@@ -572,6 +571,24 @@ class AcausalSystem(eqx.Module):
         return export_fmu(
             self, path, outputs=outputs, parameters=parameters, kinds=kinds, platforms=platforms,
             stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
+        )  # fmt: skip
+
+    def to_c(
+        self,
+        path: Any,
+        *,
+        outputs: Sequence[str] | None = None,
+        functions: Sequence[str] | None = None,
+        stop_time: float = 1.0,
+        tolerance: float = 1e-6,
+        overwrite: bool = False,
+    ) -> Any:
+        """Writes this system as C99 into a folder: see `jaxonomy_dae.fmi.write_c`, which has the same arguments."""
+        from ...fmi.plain_c import write_c
+
+        return write_c(
+            self, path, outputs=outputs, functions=functions, stop_time=stop_time, tolerance=tolerance,
+            overwrite=overwrite,
         )  # fmt: skip
 
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:

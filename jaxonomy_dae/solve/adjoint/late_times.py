@@ -15,11 +15,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from ...base.aliases import Args, Controller, PyTree, Solver, State, Terms, Time, Times
 from ...base.private_names import FOR_LATE_TIMES, missing
+from ...host.staging import is_traced
 from .closure_conversion import as_traced
 from .ends import End, ending
 
@@ -28,7 +28,7 @@ def times_fit(t0: Time, t1: Time, ts: Times, controller: Controller) -> Bool[Arr
     """True if the times to save, shape (n,) or None, are sorted and lie between t0 and t1, and if those of a
     `diffrax.StepTo` lead from t0 to t1. A Python bool where nothing is traced."""
     steps = controller.ts if isinstance(controller, diffrax.StepTo) else None
-    traced = any(isinstance(value, Tracer) for value in (t0, t1, ts, steps))
+    traced = is_traced((t0, t1, ts, steps))
     xp: Any = jnp if traced else np
     if not traced:
         t0, t1, ts, steps = (None if value is None else np.asarray(value) for value in (t0, t1, ts, steps))

@@ -9,12 +9,11 @@ from . import direct
 from .algebra import Dense, Sparse
 from .given import ByLineax
 from .mass import Mass
-from .sparse import available
+from .sparse import DENSE_UPTO, available
 
 LinearAlgebra = Dense | Sparse | ByLineax
 SPARSE_FROM = 128  # unknowns from which a sparse factorisation is taken, where the pattern is sparse enough
 SPARSE_DENSITY = 0.15
-DENSE_UPTO = 1000  # unknowns for which dense algebra will do if the extra is missing
 
 
 def choose(given: Any, n: int, pattern: Any, mass: Mass) -> LinearAlgebra:

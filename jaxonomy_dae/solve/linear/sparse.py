@@ -32,7 +32,7 @@ from ...base.errors import MissingPackage, ModelError
 from ...host.recalled import REGISTERED
 
 EXTRA = 'pip install "jaxonomy_dae[sparse]"'
-DENSE = 1000  # simultaneous equations that dense elimination may solve if there is no sparse solver: about 20 ms
+DENSE_UPTO = 1000  # unknowns that dense elimination may solve if there is no sparse solver: about 20 ms
 COLORING_WORK = 20_000_000  # pairs of entries in one row, above which colours are not sought
 
 
@@ -317,7 +317,7 @@ def _on_host(rows: np.ndarray, cols: np.ndarray, values: Any, b: Any) -> Any:
 
 def check_solvable(n: int):
     """**Raises:** `ModelError` if n simultaneous equations need a package that is not installed."""
-    if n > DENSE and not available():
+    if n > DENSE_UPTO and not available():
         raise ModelError(f"the model has {n} simultaneous equations, which need a sparse solver: {EXTRA}")
 
 

@@ -24,7 +24,7 @@ from . import dense
 from .dense import over
 from .once import once
 from .operator import SparseLinearOperator
-from .sparse import DENSE, ULPS, SparsePattern, available, check_solvable, is_double, solve_sparse
+from .sparse import DENSE_UPTO, ULPS, SparsePattern, available, check_solvable, is_double, solve_sparse
 
 LAPACK = 48  # unknowns up to which dense elimination is faster than KLU, which takes 40 µs to begin
 GOOD = 2.0**10  # residual in units of eps times the terms of an equation, above which a solution of KLU is refined
@@ -52,7 +52,7 @@ def solve_whole(
     by_lapack = solver is None and (n <= LAPACK or not (is_double() and available()))
     if by_lapack:
         check_solvable(n)
-        if n > DENSE:
+        if n > DENSE_UPTO:
             raise ModelError(
                 f"the model has {n} simultaneous equations; sparse solves compute in float64: call "
                 "jax.config.update('jax_enable_x64', True) at the start"

@@ -9,10 +9,10 @@ from jaxtyping import Array, Float
 
 from ...base.aliases import Args, State, Terms, Time
 from ...base.tolerances import TINY
+from ...graph.judgement.rank import DECOMPOSED_UPTO
 from .dae_term import FlatProblem
 from .index_one import consistent_slope
 
-LARGE = 300  # unknowns up to which eigenvalues are looked at: they cost n³, some 0.1 s at 300
 NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
 HALVINGS = 20  # of an interval in which a jump is looked for: across a millionth of it, what is smooth is the same
 Slope = Callable[[Time, Array], Float[Array, " n"]]
@@ -131,7 +131,7 @@ def decay_at(term: Terms, args: Args, t: Time, y: State) -> float:
 
 
 def _decay(slope: Slope, t: Time, y: State) -> float:
-    if not 0 < y.shape[0] <= LARGE:
+    if not 0 < y.shape[0] <= DECOMPOSED_UPTO:
         return 0.0
     matrix = np.asarray(jax.jit(jax.jacfwd(lambda v: slope(t, v)))(y))
     return max(float(-np.linalg.eigvals(matrix).real.min()), 0.0) if np.isfinite(matrix).all() else 0.0

@@ -12,12 +12,12 @@ from jax import Array
 
 from ...base.aliases import Args, Result, State, Terms, Time, Tolerance
 from ...base.tolerances import KNOWN, KNOWN_ROUNDINGS, SLIGHT, spacing
+from ...graph.judgement.rank import DECOMPOSED_UPTO
 from .causes import cause_of, first_bad_row
 from .dae_term import FlatProblem
 from .index_one import algebraic_part, consistent_slope, index_matrix
 
-LARGE = 300  # unknowns up to which matrices are looked at
-SHOWN = 4
+SHOWN = 4  # names in a sentence
 
 
 INDEX = (
@@ -66,7 +66,7 @@ def start_check(problem: FlatProblem, t: Time, rtol: Tolerance, atol: Tolerance)
     rounding = KNOWN_ROUNDINGS * spacing(problem_y.dtype) * chosen.row_sizes(jacobian, problem_y)
     if not problem.mass.is_diagonal:
         rounding = jnp.abs(jnp.asarray(problem.mass.algebraic, problem_y.dtype)) @ rounding
-    looked_at = chosen.materialise(matrix) if problem_y.shape[0] <= LARGE else None
+    looked_at = chosen.materialise(matrix) if problem_y.shape[0] <= DECOMPOSED_UPTO else None
     return jax.lax.stop_gradient(StartCheck(right, residual, rounding, shift, looked_at))
 
 
@@ -154,7 +154,7 @@ def explain_failure(term: Terms, args: Args, names: Sequence[str], at: Stopped, 
             f"The equations are not finite: {first_bad_row(problem, right, names)} is {value} {where} for a division "
             "by zero, or a root or logarithm without a value."
         )
-    if flat.shape[0] <= LARGE and problem.mass.is_singular:
+    if flat.shape[0] <= DECOMPOSED_UPTO and problem.mass.is_singular:
         chosen, _, _, matrix = index_matrix(problem, None, time, flat)
         found = null_names(np.asarray(chosen.materialise(matrix)), names)
         if found:

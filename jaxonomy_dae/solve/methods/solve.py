@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jax.typing import DTypeLike
 
@@ -193,14 +192,14 @@ def check_tolerances(rtol: Tolerance, atol: Tolerance, dtype: DTypeLike):
     """Refuses tolerances that are not numbers or that the precision cannot reach."""
     for name, value in (("rtol", rtol), ("atol", atol)):
         for leaf in jax.tree.leaves(value):
-            if isinstance(leaf, Tracer):
+            if is_traced(leaf):
                 continue
             if isinstance(leaf, str):
                 raise ModelError(f"{name} must be a number ≥ 0; got the string {leaf!r}: leave the quotes out")
             number = np.asarray(leaf, float)
             if not (np.isfinite(number).all() and (number >= 0).all()):
                 raise ModelError(f"{name} must be a number ≥ 0; got {value}")
-    if isinstance(rtol, Tracer):
+    if is_traced(rtol):
         return
     eps = float(jnp.finfo(dtype).eps)
     # A step adds rounding errors of some eps to its result, which no step size brings down.
@@ -303,7 +302,7 @@ def consistent_start(
     y, size = consistent_point(problem, None, t, problem.flat, max_steps)
     eps = float(jnp.finfo(y.dtype).eps)
     failed = ~(size <= math.sqrt(eps))
-    traced = isinstance(failed, Tracer)
+    traced = is_traced(failed)
     if throw is False or (traced and throw is None):
         y = not_a_number(y[None], ~failed[None], y0, args, t)[0]
     elif traced:

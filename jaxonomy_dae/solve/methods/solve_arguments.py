@@ -5,18 +5,17 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.typing import DTypeLike
 
 from ...base.aliases import Numeric, State, Time, Times, Tolerance
 from ...base.errors import ModelError
-from ...host.staging import as_array
+from ...host.staging import as_array, is_traced
 
 
 def check_finite(**numbers: Numeric) -> None:
     """Refuses what is not a finite number, by the names of the arguments."""
     for name, value in numbers.items():
-        if isinstance(value, Tracer):
+        if is_traced(value):
             continue
         if isinstance(value, str):
             raise ModelError(f"{name} must be a finite number; got the string {value!r}: leave the quotes out")
@@ -26,7 +25,7 @@ def check_finite(**numbers: Numeric) -> None:
 
 def check_longest_step(dtmax: Time) -> None:
     """Refuses a longest step that is not positive."""
-    if dtmax is None or isinstance(dtmax, Tracer) or (np.shape(dtmax) == () and dtmax == np.inf):
+    if dtmax is None or is_traced(dtmax) or (np.shape(dtmax) == () and dtmax == np.inf):
         return
     check_finite(dtmax=dtmax)
     if not dtmax > 0:
@@ -40,7 +39,7 @@ def check_times(t0: Time, t1: Time, ts: Times):
         return
     if np.ndim(ts) != 1 or not np.shape(ts)[0]:
         raise ModelError(f"ts must have shape (n,), n ≥ 1; got {np.shape(ts)}")
-    if any(isinstance(value, Tracer) for value in (t0, t1, ts)):
+    if is_traced((t0, t1, ts)):
         return
     saved, a, b = np.asarray(ts, float), float(t0), float(t1)
     if not ((saved >= min(a, b)) & (saved <= max(a, b))).all():
@@ -71,6 +70,6 @@ def jump_times(jump_ts: Times, dtype: DTypeLike) -> Times:
         return None
     if array.ndim > 1 or array.dtype.kind not in "iuf":
         raise ModelError(f"jump_ts must be a number or shape (n,); got {array.dtype} of shape {array.shape}")
-    if not isinstance(array, Tracer) and not np.isfinite(array).all():
+    if not is_traced(array) and not np.isfinite(array).all():
         raise ModelError("jump_ts must be finite")
     return jnp.atleast_1d(jnp.asarray(array, dtype))
