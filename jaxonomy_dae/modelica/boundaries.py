@@ -11,7 +11,7 @@ has added by itself, as `world`, if no equation of the class reads its variables
 import dataclasses
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..write.ports import inflow
@@ -41,10 +41,14 @@ class Closed(NamedTuple):
 
 
 def flattened(
-    front_end: FrontEnd, name: str, changes: str = "", source: str | None = None, frames: Sequence[str] = ()
+    front_end: FrontEnd,
+    name: str,
+    changes: str = "",
+    source: str | None = None,
+    frames: Callable[[], Sequence[str]] = list,
 ) -> Closed:
-    """Flattens a class, alone or, if its connectors ask for it, with boundaries. `frames` are its connectors that may
-    be frames: nothing tells of those that no equation turns.
+    """Flattens a class, alone or, if its connectors ask for it, with boundaries. `frames` names its connectors
+    that are frames: nothing else tells of those that no equation turns.
 
     **Raises:**
 
@@ -76,7 +80,7 @@ def flattened(
 
 
 def _alone(
-    front_end: FrontEnd, name: str, changes: str, source: str | None, frames: Sequence[str]
+    front_end: FrontEnd, name: str, changes: str, source: str | None, frames: Callable[[], Sequence[str]]
 ) -> tuple[Flattened, list[str]]:
     """The class by itself, and the overdetermined records that need a root outside."""
     extended = f"extends {name}({changes});" if changes else f"extends {name};"
@@ -94,7 +98,7 @@ def _alone(
             trees.append(error.record)
             continue
         except Unbalanced as error:
-            loose = [f"{n}{_ORIENTATION}" for n in frames if f"{n}{_ORIENTATION}" not in trees]
+            loose = [f"{n}{_ORIENTATION}" for n in frames() if f"{n}{_ORIENTATION}" not in trees]
             if not loose or error.missing != _LACKING * len(loose):
                 raise
             trees += loose

@@ -87,7 +87,9 @@ class Library:
             raise ModelError(f"there is no class '{name}' in {self.shelf}: {nearest(name, packed)}")
         if source is None:
             self._check_known(name)
-        return opened(name, flattened(self.front_end, name, changes, source, self._frames(name, source)))
+        return opened(
+            name, flattened(self.front_end, name, changes, source, functools.partial(self._frames, name, source))
+        )
 
     def _frames(self, name: str, source: str | None) -> list[str]:
         """The connectors of a class of the library that are declared as frames."""

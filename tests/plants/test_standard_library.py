@@ -406,7 +406,7 @@ PINS = {
     "Basic.Inductor": ({"L": 0.4}, lambda t, L: V * t / L),
     "Ideal.IdealDiode": (
         {"Ron": 0.1, "Goff": 1e-3, "Vknee": 0.3},
-        lambda t, Ron, Goff, Vknee: (V - Vknee * (1.0 - Ron * Goff)) / Ron + Goff * Vknee,
+        lambda t, Ron, Goff, Vknee: (V - Vknee) / Ron + Goff * Vknee,
     ),
     "Semiconductors.Diode": (
         {"Ids": 1e-6, "Vt": 0.05, "R": 50.0}, lambda t, Ids, Vt, R: Ids * (jnp.exp(V / Vt) - 1.0) + V / R
@@ -418,7 +418,7 @@ HEATS = {
 }
 TURNED = {
     "Spring": ({"c": 40.0, "phi_rel0": 0.1}, lambda t, c, phi_rel0: c * (APART - phi_rel0)),
-    "ElastoBacklash": ({"c": 40.0, "b": 0.1, "d": 1.0}, lambda t, c, b, d: c * (APART - b / 2)),
+    "SpringDamper": ({"c": 40.0, "phi_rel0": 0.1, "d": 2.0}, lambda t, c, phi_rel0, d: c * (APART - phi_rel0)),
 }
 SHIFTED = {
     "Spring": ({"c": 40.0, "s_rel0": 0.1}, lambda t, c, s_rel0: c * (APART - s_rel0)),
