@@ -92,8 +92,8 @@ FAULTS = [
     ),
     Fault(
         "solve/events/event_map.py",
-        "t + delay), state.x + instant.slope * delay",
-        "t + delay), state.x - instant.slope * delay",
+        "instant.there, state.x + instant.slope * delay)",
+        "instant.there, state.x - instant.slope * delay)",
         "tests/kernels/test_event_map.py",
     ),
     Fault(

@@ -64,12 +64,15 @@ from .write import EqnEnv as EqnEnv
 from .write import Hydraulic as Hydraulic
 from .write import Interval as Interval
 from .write import NeuralDAEBlock as NeuralDAEBlock
+from .write import Overdetermined as Overdetermined
 from .write import Planar as Planar
 from .write import Rotational as Rotational
 from .write import Thermal as Thermal
 from .write import Translational as Translational
+from .write import actual_stream as actual_stream
 from .write import assign as assign
 from .write import der as der
+from .write import in_stream as in_stream
 from .write import pre as pre
 from .write import reinit as reinit
 from .write import smooth as smooth

@@ -74,7 +74,8 @@ class Estimate:
 
     @functools.cached_property
     def reasons(self) -> tuple[str, ...]:
-        """What is against this fit, each with what to try next; empty if it can be relied on."""
+        """What is against this fit, each with what to try next; empty if it can be relied on. The first time that
+        residuals of a problem are no noise, a program is compiled that looks for what its equations lack."""
         return reasons(self)
 
     @property

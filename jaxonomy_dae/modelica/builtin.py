@@ -144,8 +144,10 @@ ALIKE = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt".split()  
 FUNCTIONS: dict[str, Callable[..., Value]] = {
     **{name: of_numbers(getattr(math, name), getattr(sympy, name)) for name in ALIKE},
     "log10": of_numbers(math.log10, lambda x: sympy.log(x) / math.log(10.0)),
-    "abs": of_numbers(lambda x: x if x >= 0 else -x, lambda x: smooth(sympy.Abs(x))),
-    "sign": of_numbers(_sign, lambda x: smooth(sympy.sign(x))),
+    "abs": of_numbers(
+        lambda x: x if x >= 0 else -x, lambda x: smooth(sympy.Abs(x, evaluate=False))
+    ),  # SymPy would expand x
+    "sign": of_numbers(_sign, lambda x: smooth(sympy.sign(x, evaluate=False))),
     "floor": of_numbers(math.floor, sympy.floor),
     "ceil": of_numbers(math.ceil, sympy.ceiling),
     "integer": lambda x: entrywise(_integer, x),

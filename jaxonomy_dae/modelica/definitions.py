@@ -24,7 +24,7 @@ class DiscreteDefinitions:
     - `stored`: those that are kept from event to event: a `when` assigns them, or their value before an event is read.
     - `followed`: those of `stored` that no `when` assigns, in the order of their definitions.
     - `equations`: what is left, for the continuous variables.
-    - `whens`: the `when`s of equations and algorithms.
+    - `whens`: the `when`s among equations; `sections`: the algorithms with a `when`.
     - `initial`: initial equations.
     - `algorithms`, `assigned`: the other algorithms, and the names that each assigns.
     """
@@ -34,6 +34,7 @@ class DiscreteDefinitions:
     followed: list[str]
     equations: list[tree.Statement]
     whens: list[tree.Branches]
+    sections: list[tuple[tree.Statement, ...]]
     initial: list[tree.Statement]
     algorithms: list[tuple[tree.Statement, ...]]
     assigned: list[list[str]]
@@ -41,24 +42,26 @@ class DiscreteDefinitions:
 
 def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> DiscreteDefinitions:
     """Splits the statements of a model."""
-    found = list(_whens_in(model.equations))
-    whens = _merged(found)
-    rest = [s for s in model.equations if s not in found] if found else list(model.equations)
+    whens = list(_whens_in(model.equations))
+    rest = [s for s in model.equations if s not in whens] if whens else list(model.equations)
     others = _with_choices(_by_entries(rest, model, is_discrete), is_discrete)
+    sections = [section for section in model.algorithms if any(_whens_in(section))]
+    by_when = set(with_entries(assigned_in((*whens, *(w for section in sections for w in _whens_in(section)))), model))
+    by_when |= {n for section in sections for n in with_entries(assigned_in(section), model) if is_discrete(n)}
     algorithms = []
     for section in model.algorithms:
-        inside = list(_whens_in(section))
-        rest = tuple(s for s in section if s not in inside)
-        whens += inside
+        rest = section
+        if section in sections:
+            rest = tuple(s for s in section if not set(with_entries(assigned_in((s,)), model)) <= by_when)
         if any(not isinstance(s, tree.Effect) for s in rest):
             algorithms.append(rest)
-    by_when = set(with_entries((name for s in whens for _, body in s.branches for name in assigned_in(body)), model))
     bindings = [
         tree.Equality(tree.Reference((d.name,)), d.value, d.line)
         for d in model.declarations
         if d.value is not None and is_discrete(d.name)
     ]
-    candidates = [(s, _definable(s, is_discrete, by_when)) for s in [*others, *bindings]]
+    given = by_when | {n for section in algorithms for n in with_entries(assigned_in(section), model)}
+    candidates = [(s, _definable(s, is_discrete, given)) for s in [*others, *bindings]]
     equations: list[tree.Statement] = [s for s, sides in candidates if not sides]
     matched, left = _matched([(s, sides) for s, sides in candidates if sides], is_discrete)
     of: dict[str, tree.Expression | int] = {**matched}
@@ -68,36 +71,24 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
         names = with_entries(assigned_in(section), model)
         assigned.append(names)
         for name in names:
+            if name in by_when:
+                continue
             if is_discrete(name):
                 of[name] = k
             else:
                 equations.append(tree.Equality(tree.Reference((name,)), OfAlgorithm(k, name), section[0].line))  # type: ignore[arg-type]
     read_before = set(with_entries(_read_before((model.equations, model.algorithms, tuple(bindings))), model))
+    for section in algorithms:
+        read_before |= {n for n in remembered(section, model) if is_discrete(n)}
     followed = [name for name in of if name in read_before and name not in by_when]
     return DiscreteDefinitions(
-        of=of, stored=by_when | set(followed), followed=followed, equations=equations, whens=whens,
+        of=of, stored=by_when | set(followed), followed=followed, equations=equations, whens=whens, sections=sections,
         initial=list(model.initial_equations), algorithms=algorithms, assigned=assigned,
     )  # fmt: skip
 
 
 def _whens_in(statements: Iterable[tree.Statement]) -> Iterator[tree.Branches]:
     return (s for s in statements if isinstance(s, tree.Branches) and s.kind == "when")
-
-
-def _merged(whens: list[tree.Branches]) -> list[tree.Branches]:
-    """The whens of equations, those with one condition as one: what they assign at an instant holds for all of them."""
-    by_condition: dict[tree.Expression, int] = {}
-    out: list[tree.Branches] = []
-    for s in whens:
-        condition, body = s.branches[0]
-        if len(s.branches) == 1 and condition in by_condition:
-            first = out[by_condition[condition]]
-            out[by_condition[condition]] = first._replace(branches=((condition, first.branches[0][1] + body),))
-        else:
-            if len(s.branches) == 1:
-                by_condition[condition] = len(out)
-            out.append(s)
-    return out
 
 
 def _by_entries(
@@ -129,8 +120,8 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
         conditions = [c for c, _ in s.branches]
         bodies = [_with_choices(body, is_discrete) for _, body in s.branches]
         values = [
-            {e.left.path: e.right for e in body
-             if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(e.left.path)}
+            {_name(e.left): e.right for e in body
+             if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(_name(e.left))}
             for body in bodies
         ]  # fmt: skip
         names = [n for n in values[0] if all(n in v for v in values)] if conditions[-1] == tree.Truth(True) else []
@@ -138,7 +129,7 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
             branches = tuple((c, v[n]) for c, v in zip(conditions[:-1], values, strict=False))
             out.append(tree.Equality(tree.Reference((n,)), tree.Choice(branches, values[-1][n]), s.line))
         rest = tuple(
-            (c, tuple(e for e in body if not (isinstance(e, tree.Equality) and getattr(e.left, "path", None) in names)))
+            (c, tuple(e for e in body if not (isinstance(e, tree.Equality) and _given(e) in names)))
             for c, body in zip(conditions, bodies, strict=True)
         )
         if any(body for _, body in rest):
@@ -147,16 +138,17 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
 
 
 def _definable(
-    s: tree.Statement, is_discrete: Callable[[str], bool], by_when: set[str]
+    s: tree.Statement, is_discrete: Callable[[str], bool], given: set[str]
 ) -> list[tuple[str, tree.Expression]]:
-    """The variables that an equation can determine, each with its value."""
+    """The variables that an equation can determine, each with its value; `given` are those that whens and algorithms
+    determine."""
     if not isinstance(s, tree.Equality):
         return []
     out = []
     for side, other in ((s.left, s.right), (s.right, s.left)):
         if isinstance(side, tree.Reference):
-            name = side.path
-            if is_discrete(name) and name not in by_when:
+            name = _name(side)
+            if is_discrete(name) and name not in given:
                 out.append((name, other))
     return out
 
@@ -180,7 +172,7 @@ def _matched(
 
     def may_be_left(k: int) -> bool:
         other = candidates[k][1][0][1]
-        return len(candidates[k][1]) == 1 and isinstance(other, tree.Reference) and not is_discrete(other.path)
+        return len(candidates[k][1]) == 1 and isinstance(other, tree.Reference) and not is_discrete(_name(other))
 
     for k in sorted(range(len(candidates)), key=may_be_left):
         if not place(k, set()):
@@ -205,10 +197,57 @@ def assigned_in(statements: tuple[tree.Statement, ...]) -> Iterator[str]:
             yield from assigned_in(s.body)
 
 
+def _given(e: tree.Equality) -> str:
+    """The name of the variable that stands alone on the left; "" if there is none."""
+    return _name(e.left) if isinstance(e.left, tree.Reference) else ""
+
+
 def _name(e: tree.Reference) -> str:
     """The name of what a reference stands for; a subscript that is not a number is '?' in it."""
     numbers = [",".join(str(getattr(x, "value", "?")) for x in s) for s in e.subscripts]
     return ".".join(f"{part}[{n}]" if n else part for part, n in zip(e.parts, numbers, strict=True))
+
+
+def remembered(section: tuple[tree.Statement, ...], model: tree.Class) -> set[str]:
+    """The variables of an algorithm whose value before it matters: they are read before they are assigned, or not
+    assigned in every case (Modelica Language Specification 3.6, 11.1.2).
+
+    **Raises:**
+
+    - `ModelError` for a `break` or `return` outside of a loop.
+    """
+    own = set(with_entries(assigned_in(section), model))
+    found: set[str] = set()
+
+    def entries(names: Iterable[str]) -> set[str]:
+        return set(with_entries(names, model)) & own
+
+    def read(part: object, done: set[str]) -> None:
+        found.update(entries(_name(e) for e in tree.each_part(part) if isinstance(e, tree.Reference)) - done)
+
+    def carried_out(statements: tuple[tree.Statement, ...], done: set[str]) -> set[str]:
+        """The variables that are assigned for sure after statements; `done` are those before."""
+        for s in statements:
+            if isinstance(s, tree.Assignment | tree.Equality):
+                read(s.right, done)
+                done = done | entries(assigned_in((s,)))
+            elif isinstance(s, tree.Loop):
+                done = done | entries(assigned_in((s,)))
+            elif isinstance(s, tree.Branches):
+                read(tuple(c for c, _ in s.branches), done)
+                ends = [carried_out(body, done) for _, body in s.branches]
+                ends += [] if s.branches[-1][0] == tree.Truth(True) else [done]
+                done = set.intersection(*ends)
+                found.update(entries(assigned_in((s,))) - done)
+            elif isinstance(s, tree.Jump):
+                raise ModelError(
+                    f"line {s.line}: '{s.kind}' stands outside of a loop: which statements it leaves out is lost where "
+                    "the loop has been written out"
+                )
+        return done
+
+    found |= own - carried_out(section, set())
+    return found
 
 
 def with_entries(names: Iterable[str], model: tree.Class) -> list[str]:

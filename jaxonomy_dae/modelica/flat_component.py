@@ -6,13 +6,14 @@ from ..base.errors import ModelError, nearest
 from ..write.component import Component
 from ..write.environment import EqnEnv
 from .continuous import write_equation
-from .events import write_end_of_start, write_modes, write_when
+from .discrete_map import DiscreteMap
 from .flat_model import FlatModel
 from .laws import equation_of, write_law
 from .scope import Scope, located
 from .semi_linear import with_chains_solved
-from .starts import in_order, write_initial_algorithm, write_initial_equation
+from .starts import hold_waiting, in_order, write_initial_algorithm, write_initial_equation
 from .values import as_number
+from .whens import read_followed, read_section, read_when
 
 
 class FlatComponent(Component):
@@ -52,14 +53,21 @@ class FlatComponent(Component):
         replaced = {variable: equation_of(scope, variable) for variable in flat.laws}
         equations = [s for s in found.equations if not any(s is r.statement for r in replaced.values())]
         equations = with_chains_solved(equations, scope.interpreter.name_of)
-        write_modes(scope)
+        discrete = DiscreteMap(scope)
+        for name in found.followed:
+            located(flat.name, scope.declared[name].line, read_followed, discrete, name)
+        for s in found.whens:
+            located(flat.name, s.line, read_when, discrete, s)
+        for section in found.sections:
+            located(flat.name, section[0].line, read_section, discrete, section)
+        discrete.share_relations()
         for write, statements in (
-            (write_when, found.whens),
             (write_equation, equations),
             (write_initial_equation, in_order(scope, found.initial)),
         ):
             for s in statements:
                 located(flat.name, s.line, write, scope, s)
+        hold_waiting(scope)
         for statements in filter(None, flat.model.initial_algorithms):
             located(flat.name, statements[0].line, write_initial_algorithm, scope, statements)
         for variable, law in flat.laws.items():
@@ -71,7 +79,7 @@ class FlatComponent(Component):
                 )
             if output not in self.variables and output not in self.parameters:
                 self.output(output, as_number(scope.value(output)))
-        write_end_of_start(scope)
+        discrete.write()
 
     def _claim(self, name: str, what: str):
         self._check_open(f"declare its {what} '{name}'")

@@ -16,7 +16,24 @@ from .rumoca_expressions import Json
 _PLACE = re.compile(r"× (?P<what>[^\n]*)\s+╭─\[[^\]]*?:(?P<line>\d+):(?P<column>\d+)\]")
 _UNRESOLVED = re.compile(r"unresolved (type reference|function call|component reference|[\w ]+): '([^']+)'")
 _UNBALANCED = re.compile(r"unbalanced model: (\d+) equations, (\d+) unknowns")
+_UNROOTED = re.compile(r"Connections\.branch\(([^,]+), [^)]+\) belongs to a virtual connection graph component with no")
 _CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")
+
+
+class Unrooted(ModelError):
+    """An overdetermined record, `record`, belongs to a graph without a root."""
+
+    def __init__(self, message: str, record: str):
+        super().__init__(message)
+        self.record = record
+
+
+class Unbalanced(ModelError):
+    """A model has other than one equation for each unknown; `missing` are those that it lacks."""
+
+    def __init__(self, message: str, missing: int):
+        super().__init__(message)
+        self.missing = missing
 
 
 class Flattened(NamedTuple):
@@ -53,7 +70,12 @@ class FrontEnd:
                 found = session.loads(text, model=model)
             return Flattened(found.name, found.to_dict("dae"), found.to_dict("flat"))
         except (self.rumoca.RumocaError, RuntimeError) as error:
-            raise ModelError(self._said(text or "", model, str(error))) from None
+            said = self._said(text or "", model, str(error))
+            if record := _UNROOTED.search(str(error)):
+                raise Unrooted(said, record[1]) from None
+            if counts := _UNBALANCED.search(str(error)):
+                raise Unbalanced(said, int(counts[2]) - int(counts[1])) from None
+            raise ModelError(said) from None
 
     def _opened(self) -> Any:
         if self.session is None:

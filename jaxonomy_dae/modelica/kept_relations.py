@@ -4,51 +4,89 @@ Between events the truth is kept, as in Modelica. All modes of an instant see th
 rests at the level, and continuous equations see the one that the modes see.
 """
 
+from collections.abc import Collection
+
 import sympy
 
 from ..base.aliases import Condition, Expression
-from ..write.automatic_events import varies
+from ..graph.expressions.from_sympy import symbols_of
+from ..graph.expressions.smooth import Smooth
+from ..write.automatic_events import ROUNDING, varies
 from ..write.component import Component
+from ..write.symbols import DiscreteSymbol, VariableSymbol
 from .values import Value, plain
 
 _ORDER = (sympy.StrictGreaterThan, sympy.GreaterThan, sympy.StrictLessThan, sympy.LessThan)
+_JUMPING = (*ROUNDING, sympy.sign, sympy.Heaviside)
 
 
 class KeptRelations:
-    """The relations of a component whose truth is kept."""
+    """The relations of a component whose truth is kept; those of `quiet` are not."""
 
-    def __init__(self, component: Component):
-        self.component = component
-        # (form in equations, form in conditions of events)
-        self.forms: dict[Condition, tuple[Condition, Condition]] = {}
+    def __init__(self, component: Component, quiet: Collection[Condition]):
+        self.component, self.quiet = component, quiet
+        self.forms: dict[Condition, Condition] = {}
+        self.variables: dict[Expression, Expression] = {}
 
-    def in_events(self, condition: Value, alone: bool = True) -> Value:
-        """A condition of an event in kept truths. One relation alone stays as it is: it is found where it turns."""
-        if isinstance(condition, bool) or (alone and isinstance(condition, _ORDER)):
-            return condition
-        return plain(self._replaced(condition, 1))
+    def in_discrete(self, value: Value) -> Value:
+        """A value of discrete equations with all its relations replaced by their kept truths."""
+        if not isinstance(value, sympy.Basic):
+            return value
+        found = {r: self._form(r) for r in _outermost(value, _ORDER) if varies(r) and r not in self.quiet}
+        return plain(value.xreplace(found)) if found else value
+
+    def in_bodies(self, value: Value) -> Value:
+        """A value in the body of a `when` with those of its relations replaced that others read, or that turn at times
+        known beforehand: the rest is looked at where the body holds only."""
+        if not isinstance(value, sympy.Basic):
+            return value
+        found = {r: self._form(r) for r in _outermost(value, _ORDER) if self._known(r) or _is_of_time(r)}
+        return plain(value.xreplace(found)) if found else value
 
     def in_equations(self, expression: Expression) -> Expression:
-        """An expression with relations that events read replaced by their kept truths."""
+        """An expression with relations that discrete equations read replaced by their kept truths."""
         if not self.forms:
             return expression
-        found = {r: self._form(r, 0) for r in expression.atoms(*_ORDER) if self._known(r)}
+        found = {r: self._form(r) for r in expression.atoms(*_ORDER) if self._known(r)}
         return expression.xreplace(found) if found else expression
 
-    def _replaced(self, condition: Condition, form: int) -> Condition:
-        if isinstance(condition, _ORDER) and varies(condition):
-            return self._form(condition, form)
-        if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
-            return condition.func(*(self._replaced(part, form) for part in condition.args))
-        return condition
+    def with_jumps_as_variables(self, value: Value) -> Value:
+        """A value with whole parts of what changes in time as variables, whose equations have events as others have."""
+        if not isinstance(value, sympy.Basic):
+            return value
+        for e in _outermost(value, _JUMPING):
+            if e not in self.variables and varies(e):
+                self.variables[e] = self.component._as_variable(e)
+        return value.xreplace(self.variables)
 
     def _known(self, relation: Condition) -> bool:
         return relation in self.forms or sympy.Not(relation) in self.forms
 
-    def _form(self, relation: Condition, form: int) -> Condition:
+    def _form(self, relation: Condition) -> Condition:
         opposite = sympy.Not(relation)
         if opposite in self.forms:
-            return sympy.Not(self.forms[opposite][form])
+            return sympy.Not(self.forms[opposite])
         if relation not in self.forms:
-            self.forms[relation] = self.component._followed(relation)
-        return self.forms[relation][form]
+            self.forms[relation] = self.component._followed(relation)[0]
+        return self.forms[relation]
+
+
+def _is_of_time(relation: Condition) -> bool:
+    symbols = symbols_of(relation)
+    return varies(relation) and not any(isinstance(s, VariableSymbol | DiscreteSymbol) for s in symbols)
+
+
+def _outermost(value: Expression, kinds: tuple[type, ...]) -> list[Expression]:
+    """The parts of these kinds that stand in no other one, nor in what is smooth; each once, in an order that is the
+    same in every process."""
+    walk = sympy.preorder_traversal(value)
+    seen: set[Expression] = set()
+    found: list[Expression] = []
+    for e in walk:
+        if isinstance(e, Smooth) or e in seen:
+            walk.skip()
+        elif isinstance(e, kinds):
+            walk.skip()
+            seen.add(e)
+            found.append(e)
+    return sorted(found, key=str) if len(found) > 1 else found

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import ModelError, nearest
+from .boundaries import flattened
 from .front_end import FrontEnd
 from .modification import modification
 from .open_class import OpenClass, opened
@@ -14,7 +15,7 @@ from .open_component import OpenComponent
 from .shelf import Shelf
 from .sources import Found, Sources
 
-_WRAPPER = "Opened"  # the model that extends a class with modifications
+_FRAME = re.compile(r"(^|\.)Frame(_[ab])?$")  # types of connectors of three-dimensional bodies
 
 
 class Library:
@@ -86,10 +87,17 @@ class Library:
             raise ModelError(f"there is no class '{name}' in {self.shelf}: {nearest(name, packed)}")
         if source is None:
             self._check_known(name)
-        if not changes:
-            return opened(name, self.front_end.flatten(source, name))
-        text = f"{source or ''}\nmodel {_WRAPPER} extends {name}({changes}); end {_WRAPPER};\n"
-        return opened(name, self.front_end.flatten(text, _WRAPPER))
+        return opened(
+            name, flattened(self.front_end, name, changes, source, functools.partial(self._frames, name, source))
+        )
+
+    def _frames(self, name: str, source: str | None) -> list[str]:
+        """The connectors of a class of the library that are declared as frames."""
+        if source is not None:
+            return []
+        found = self._names.find(name)
+        declared = self._names.declared(found) if isinstance(found, Found) else ()
+        return [d.name for d in declared if _FRAME.search(d.type) and not d.dimensions]
 
     def _check_known(self, name: str) -> None:
         """Names what is near a class that no root holds, before the front end reads the whole library."""

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ..base.errors import ModelError
+from .boundaries import Closed, without_boundaries
 from .external_objects import with_external_objects
 from .flat_model import FlatModel
-from .front_end import Flattened
 from .read_rumoca import read_open
 from .rumoca_expressions import Json
 
@@ -24,11 +24,14 @@ AS_TEXT = (
 
 @dataclasses.dataclass(frozen=True)
 class OpenPort:
-    """A connector: pairs (name, unit) of its potentials and of its flows, which are counted positive into the class."""
+    """A connector: pairs (name, unit) of its potentials, of its flows, which count positive into the class, and of its
+    streams; and the names of those potentials that are the overdetermined record of a frame."""
 
     name: str
     potentials: tuple[tuple[str, str], ...]
     flows: tuple[tuple[str, str], ...]
+    streams: tuple[tuple[str, str], ...] = ()
+    orientation: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +46,8 @@ class OpenClass:
     - `tunable`: parameters that stand as symbols in the equations.
     - `required`: those of them without a value.
     - `fixed`: the other parameters, which decide the equations or are given by the class.
+    - `branches`: pairs of ports whose orientations the class relates.
+    - `roots`: ports whose orientations the class determines.
     """
 
     name: str
@@ -54,21 +59,25 @@ class OpenClass:
     tunable: tuple[str, ...]
     required: tuple[str, ...]
     fixed: tuple[str, ...]
+    branches: tuple[tuple[str, str], ...] = ()
+    roots: tuple[str, ...] = ()
 
 
-def opened(name: str, found: Flattened) -> OpenClass:
+def opened(name: str, closed: Closed) -> OpenClass:
     """A class with open connectors, from its flattening.
 
     **Raises:**
 
-    - `ModelError` for connectors with stream variables, of overdetermined graphs, and without variables; and for those
-        that have not as many flows as potentials.
+    - `ModelError` for connectors of overdetermined graphs other than those of frames, and for those without variables;
+        and for those that have not as many flows as potentials.
     """
+    found = closed.found
     if found.flat.get("is_partial"):
         raise ModelError(f"'{name}' is partial: open a class that extends it, or write one as source=…")
     ports = tuple(p for top in found.flat["top_level_connectors"] for p in _ports(name, top, found.flat["variables"]))
-    flows = [f"{port.name}.{flow}" for port in ports for flow, _ in port.flows]
+    flows = [f"{port.name}.{flow}" for port in ports for flow, _ in port.flows if not port.streams]
     flat = with_external_objects(read_open(found.dae, name.rpartition(".")[2], flows), found.flat)
+    flat = without_boundaries(flat, closed.outer)
     storage = found.dae["storage"]
     tunable, required, fixed = [], [], []
     roles: dict[str, list[str]] = {"input": [], "output": []}
@@ -88,8 +97,28 @@ def opened(name: str, found: Flattened) -> OpenClass:
             roles.get(at["causality"], []).extend(names)
     return OpenClass(
         name, found.flat.get("model_description") or "", flat, ports, tuple(roles["input"]), tuple(roles["output"]),
-        tuple(tunable), tuple(required), tuple(fixed),
+        tuple(tunable), tuple(required), tuple(fixed), *_tree_of(ports, closed),
     )  # fmt: skip
+
+
+def _tree_of(ports: Sequence[OpenPort], closed: Closed) -> tuple[tuple[tuple[str, str], ...], tuple[str, ...]]:
+    """The branches between ports with orientations, and the ports that are roots."""
+    groups: dict[str, set[str]] = {}
+    for a, b in closed.graph:
+        joined = groups.get(a, {a}) | groups.get(b, {b})
+        groups |= dict.fromkeys(joined, joined)
+    branches, roots = [], []
+    seen: dict[int, str] = {}
+    for port in ports:
+        if port.orientation:
+            record = f"{port.name}.{port.orientation[0].partition('.')[0]}"
+            group = groups.get(record, {record})
+            first = seen.setdefault(id(group), port.name)
+            if first != port.name:
+                branches.append((first, port.name))
+            elif group & set(closed.roots):
+                roots.append(port.name)
+    return tuple(branches), tuple(roots)
 
 
 def _ports(name: str, top: str, variables: Mapping[str, Json]) -> Iterator[OpenPort]:
@@ -99,21 +128,23 @@ def _ports(name: str, top: str, variables: Mapping[str, Json]) -> Iterator[OpenP
     where = f"'{name}': the connector '{top}'"
     if not inside:
         raise ModelError(f"{where} is expandable: {AS_TEXT}")
-    if any(v["stream"] for v in inside.values()):
-        raise ModelError(f"{where} has stream variables, whose mixing its surroundings decide: {AS_TEXT}")
-    if any(v["is_overconstrained"] for v in inside.values()):
+    if any(v["is_overconstrained"] and not re.search(r"\.R\.[Tw]$", n) for n, v in inside.items()):
         raise ModelError(f"{where} is of an overdetermined graph, whose root its surroundings decide: {AS_TEXT}")
     scalars = {entry: v for n, v in physical.items() for entry in _entries(n, v["dims"])}
     for group in _innermost(top, list(scalars), scalars):
         prefix, members = group
-        sides: dict[bool, list[tuple[str, str]]] = {False: [], True: []}
+        sides: dict[str, list[tuple[str, str]]] = {"potential": [], "flow": [], "stream": []}
         for n in members:
-            sides[scalars[n]["flow"]].append((n[len(prefix) + 1 :], scalars[n].get("unit") or ""))
-        if len(sides[False]) != len(sides[True]):
-            counts = f"{len(sides[False])} potentials and {len(sides[True])} flows"
+            kind = next((k for k in ("flow", "stream") if scalars[n][k]), "potential")
+            sides[kind].append((n[len(prefix) + 1 :], scalars[n].get("unit") or ""))
+        orientation = tuple(n[len(prefix) + 1 :] for n in members if scalars[n]["is_overconstrained"])
+        freedom = len(sides["potential"]) - len(orientation) + (3 if orientation else 0)
+        if freedom != len(sides["flow"]):
+            counts = f"{len(sides['potential'])} potentials and {len(sides['flow'])} flows"
             raise ModelError(f"'{name}': the connector '{prefix}' has {counts}: {AS_TEXT}")
         if members:
-            yield OpenPort(prefix, tuple(sides[False]), tuple(sides[True]))
+            potentials, flows, streams = map(tuple, sides.values())
+            yield OpenPort(prefix, potentials, flows, streams, orientation)
 
 
 def _is_constant(v: Json) -> bool:

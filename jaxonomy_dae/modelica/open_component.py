@@ -54,9 +54,13 @@ class OpenComponent(FlatComponent):
             raise ModelError(
                 f"{where}: the class gives no value to {_listed(missing)}: {type(self).__name__}(…, {least})"
             )
-        self._of_ports = {f"{p.name}.{v}" for p in of.ports for v, _ in (*p.potentials, *p.flows)}
         for port in of.ports:
             self.ports[port.name] = Port(self, port.name, domain_of(port))
+        self._of_ports = {f"{p.name}.{v}" for p in self.ports.values() for v, _ in p.domain.variables}
+        for a, b in of.branches:
+            self.declare_branch(self.ports[a], self.ports[b])
+        for a in of.roots:
+            self.declare_root(self.ports[a])
         flat = of.flat
         declared = {d.name: d for d in flat.model.declarations}
         for variable, value in (start or {}).items():

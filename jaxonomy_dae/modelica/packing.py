@@ -23,7 +23,7 @@ WITHOUT_COMPONENTS = frozenset({"Examples", "Icons", "Interfaces", "UsersGuide",
 
 class Row(NamedTuple):
     """What became of a class: `translated`, `opened` if its equations are not translated, or `refused`; with the
-    equations and unknowns that it lacks none of beside one equation for each of its `flows`."""
+    equations and unknowns that it lacks none of beside one equation for each of its `flows`, streams among them."""
 
     name: str
     state: str
@@ -90,7 +90,7 @@ def tried(library: Library, name: str) -> tuple[Row, OpenClass | None]:
         return Row(name, "refused", reason=" ".join(str(error).split())), None
     outside = {"parameter", "constant", "input"}
     unknowns = sum(not d.prefixes & outside and d.type != "String" for d in found.flat.model.declarations)
-    counts = len(found.flat.model.equations), unknowns, sum(len(p.flows) for p in found.ports)
+    counts = len(found.flat.model.equations), unknowns, sum(len(p.flows) + len(p.streams) for p in found.ports)
     values: dict[str, Any] = dict.fromkeys(found.required, 1.0)
     try:
         component_of(found)(EqnEnv(), "x", **values)

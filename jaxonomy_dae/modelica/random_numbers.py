@@ -18,7 +18,7 @@ import sympy
 from ..base.aliases import Numeric
 from ..base.errors import ModelError
 from ..write.component import Component
-from ..write.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+from ..write.symbols import DiscreteSymbol, VariableSymbol
 from .values import Results, Value
 
 Word: TypeAlias = Numeric  # an int below 2^64, or an array of the type uint64
@@ -143,9 +143,8 @@ class RandomNumbers:
         return Results([r, after])
 
     def _as_variable(self, entry: Value) -> VariableSymbol:
-        if not isinstance(entry, int | float | DiscreteSymbol | PreviousSymbol):
+        if not isinstance(entry, int | float | DiscreteSymbol):
             raise ModelError(f"the state of a random generator is kept in variables that a when assigns; got {entry}")
-        present = DiscreteSymbol(entry.path) if isinstance(entry, PreviousSymbol) else sympy.sympify(entry)
         symbol = self.component.variable(f":state[{len(self.component.variables)}]")
-        self.component.add_equations(sympy.Eq(symbol, present, evaluate=False))
+        self.component.add_equations(sympy.Eq(symbol, entry, evaluate=False))
         return symbol

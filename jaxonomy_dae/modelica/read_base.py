@@ -63,6 +63,25 @@ def written(name: str) -> tree.Reference:
     return tree.Reference(tuple(parts), tuple(subscripts))
 
 
+# The names of the arguments of operators that are read by their places.
+_ARGUMENTS = {
+    "smooth": ("p", "expr"), "homotopy": ("actual", "simplified"), "delay": ("expr", "delayTime", "delayMax"),
+    "semiLinear": ("x", "positiveSlope", "negativeSlope"), "max": ("x", "y"), "min": ("x", "y"),
+    "sample": ("start", "interval"),
+}  # fmt: skip
+
+
+def _call(
+    function: str, arguments: tuple[tree.Expression, ...], named: tuple[tuple[str, tree.Expression], ...]
+) -> tree.Call:
+    """A call; named arguments of operators in their places."""
+    given = dict(named)
+    order = _ARGUMENTS.get(function, ())[len(arguments) :]
+    if not given or not given.keys() <= set(order) or list(order[: len(given)]) != [n for n in order if n in given]:
+        return tree.Call(function, arguments, named)
+    return tree.Call(function, (*arguments, *(given[n] for n in order if n in given)), ())
+
+
 class Reader:
     def __init__(self, text: str):
         self.text = text
@@ -270,7 +289,7 @@ class Reader:
                 subscripts.append(self._subscripts())
         if self.take("("):
             arguments, named = self._arguments(")")
-            return self._parts_of(tree.Call(".".join(parts), arguments, named))
+            return self._parts_of(_call(".".join(parts), arguments, named))
         return tree.Reference(tuple(parts), tuple(subscripts))
 
     def _parts_of(self, whole: tree.Expression) -> tree.Expression:

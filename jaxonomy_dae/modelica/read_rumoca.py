@@ -64,6 +64,7 @@ class _Reader:
     def __init__(self, of: RumocaExpressions, flows: frozenset[str] | None = None):
         self.of = of
         self.flows = flows  # of open connectors; None for a model that is complete
+        self.single = {v["name"] for v in of.variables if not of.types[v["value_type"]]["dimensions"]}
 
     def _continuous(self) -> list[Json]:
         """The continuous equations, without those that close open connectors: one for each of their flows."""
@@ -80,10 +81,11 @@ class _Reader:
 
     def _set_to_zero(self, op: Json) -> str:
         """The flow that an equation of a connection sets to zero; the empty text for all others."""
-        inside = op.get("residual", {})
+        kind, inside = next(iter(op.items()))
         if (inside.get("provenance") or {}).get("origin") != {"generated": "flow_balance_equation"}:
             return ""
-        e = self.of.expression(inside["residual"], {})
+        bodies = [inside["residual"]] if kind == "residual" else inside["bodies"]
+        e = self.of.expression(bodies[0], {})
         return e.path if isinstance(e, tree.Reference) and not any(e.subscripts) else ""
 
     def model(self) -> FlatModel:
@@ -111,6 +113,10 @@ class _Reader:
             self.of.refuse(f"the variable '{v['name']}' of the kind {of['scalar']} {role}", v.get("declaration"))
         prefixes = {role} & PREFIX | ({"discrete"} if role == "discrete_real" else set())
         constant = role in ("parameter", "constant")
+        if 0 in of["dimensions"]:  # no entries: the empty array is all that there is to know
+            empty = tree.Array((tree.Array(()),) * of["dimensions"][0])
+            yield tree.Declaration(frozenset({"constant"}), SCALAR[of["scalar"]], v["name"], (), {}, empty, "", 0)
+            return
         for k, place in enumerate(itertools.product(*(range(1, n + 1) for n in of["dimensions"]))):
             fixed = at.get("fixed")
             modifiers: tree.Modifiers = {
@@ -140,14 +146,26 @@ class _Reader:
     def _entry(self, number: int, place: tuple[int, ...]) -> tree.Expression:
         """One entry of an array; a value that is no array counts for all entries."""
         e = self.of.expression(number, {})
+        if self._is_one_number(e):
+            return e
         for depth, k in enumerate(place):
             if isinstance(e, tree.Array):
                 e = e.entries[k - 1]
-            elif isinstance(e, tree.Number | tree.Truth | tree.Text):
-                return e
             else:
                 return tree.Part(e, None, tuple(map(tree.Number, place[depth:])))
         return e
+
+    def _is_one_number(self, e: tree.Expression) -> bool:
+        """True for what is seen to be no array: numbers, variables without dimensions, and sums and so on of these."""
+        if isinstance(e, tree.Reference):
+            return e.path in self.single and not any(e.subscripts)
+        if isinstance(e, tree.Binary):
+            return self._is_one_number(e.left) and self._is_one_number(e.right)
+        if isinstance(e, tree.Unary):
+            return self._is_one_number(e.operand)
+        if isinstance(e, tree.Choice):
+            return all(map(self._is_one_number, [*(value for _, value in e.branches), e.otherwise]))
+        return isinstance(e, tree.Number | tree.Truth | tree.Text)
 
     # --- equations ---------------------------------------------------------------------------------------------------
 

@@ -148,6 +148,10 @@ class RumocaExpressions:
             _, owner, first, _ = self.nodes[inside["owner"]]
             arguments = self._arguments(owner, first, places)
             return tree.Call(self._function_name(inside["function"], inside["output"]), arguments, ())
+        if kind == "range":
+            step = inside["explicit_step_expression"]
+            first, last = (self.expression(inside[f"{end}_expression"], places) for end in ("start", "stop"))
+            return tree.Range(first, tree.Number(1) if step is None else self.expression(step, places), last)
         if kind == "array_update":
             return self._updated(number)
         if kind == "runtime_quotient_owner":

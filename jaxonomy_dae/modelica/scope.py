@@ -5,18 +5,20 @@ parameters are constants. Boolean, Integer and enumeration variables are of two 
 event are discrete variables; the others are expressions, put in wherever they are read.
 """
 
-import contextlib
+import dataclasses
 import functools
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TypeVar
 
 import sympy
 
+from ..base.aliases import Condition
 from ..base.errors import ModelError
+from ..graph.expressions.from_sympy import symbols_of
 from ..write.component import Component
-from ..write.events import terminate
-from ..write.symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, der
+from ..write.events import NO_FLAG, Assign, Sampled, terminate
+from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
 from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter
@@ -25,12 +27,15 @@ from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
-from .tree import Assignment, Branches, Declaration, Equality, Expression, Reference, Truth, entry_name
+from .tree import Assignment, Class, Declaration, Equality, Expression, Reference, Truth, entry_name
 from .values import Record, Value, as_number, both, is_condition, negated, plain
+from .written_out import entries_of, unrolled
 
 REAL = "Real"
 _TEXTS = ("String", "StateSelect", "AssertionLevel")
 _CONSTANT = {"parameter", "constant"}
+# The values of `Scope.initial`: before the first iteration, in the first one, and from the second one on.
+STARTING, AT_FIRST, STARTED = 2, 1, 0
 
 
 class Scope:
@@ -42,13 +47,14 @@ class Scope:
     - `interpreter`: evaluates expressions in these names.
     - `definitions`: which statement determines which variable.
     - `kept`: relations whose truth is kept between events.
-    - `in_action`: True while values are evaluated that an event writes: `pre(m)` is then the value before it.
     - `names`: names of long expressions of functions.
-    - `initial`: the discrete variable that is 1 at the initial time; None if nothing asks for it.
+    - `initial`: the discrete variable that says how far the initial time is; None if nothing asks for it.
+    - `carried_out`: what algorithms assign, by their numbers.
+    - `said`: the discrete variables of which initial equations say what they are; `initially`: what that is, where it
+      is not known beforehand. `waiting`: initial equations of discrete variables that wait for others, which they do
+      while `postpones` is true.
+    - `ticks`: the discrete variables that are 1 in the iteration in which a clock ticks, by the clock.
     - `as_numbers`: True while parameters are read as their values, which are final then.
-    - `pending`: conditions that hold while a mode is not what its equation says.
-    - `done`: for whens that assign what modes read, the discrete variable that is 1 from their event until their
-      condition is false.
     """
 
     def __init__(
@@ -57,14 +63,12 @@ class Scope:
     ):  # fmt: skip
         self.flat, self.component, self.numbers = flat, component, numbers
         self.given, self.signals = given or {}, signals
-        self.kept = KeptRelations(component)
         self.declared = {d.name: d for d in flat.model.declarations}
         self.known: dict[str, Value] = {"time": component.ev.t}
-        self.known_at_events: dict[str, Value] = {}
         self.entries, self.fields = _gather(self.declared)
         self.being: list[str] = []
         special: dict[str, Callable[..., Value]] = {
-            "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self.at_start,
+            "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self._is_initial,
             "terminal": lambda: False, "sample": self._sample, "delay": _delay,
         }  # fmt: skip
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
@@ -75,26 +79,50 @@ class Scope:
             | {name: functools.partial(self._read_table, EXTERNALS[name]) for name in GET_VALUE},
             self.entries, self._named,
         )  # fmt: skip
-        self.definitions = find_definitions(flat.model, self.is_discrete)
+        self.kept = KeptRelations(component, self.interpreter.quieted)
+        self.as_numbers = False
+        self.final: dict[str, Value] = {}
+        self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
+        self.declared = {d.name: d for d in flat.model.declarations}
+        entries, fields = _gather(self.declared)
+        self.entries.update(entries)
+        self.fields.update(fields)
+        self.definitions = find_definitions(self.flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
         self.ends: set[sympy.Basic] = set()  # conditions that end the run
-        self.in_action = self.as_numbers = False
-        self.final: dict[str, Value] = {}
         self.initial: DiscreteSymbol | None = None
-        self.pending: list[Value] = []
-        self.done: dict[Branches, DiscreteSymbol] = {}
+        self.carried_out: dict[int, dict[str, Value]] = {}
+        self.said: set[DiscreteSymbol] = set()
+        self.waiting: list[tuple[Value, Value]] = []
+        self.postpones = True
+        self.initially: dict[DiscreteSymbol, Value] = {}
+        self.ticks: dict[Sampled, DiscreteSymbol] = {}
+
+    def _written_out(self, model: Class) -> Class:
+        """The model with its arrays of variables and its loops of equations written out; sizes and ranges are known
+        now."""
+
+        def values_of(over: Expression | None) -> list:
+            if over is None:
+                raise ModelError("it must be written out, as 1:n")
+            values = self.interpreter.constant(over)
+            return values if isinstance(values, list) else [values]
+
+        def is_array(e: Expression) -> bool:
+            return isinstance(self.evaluate(e), list)
+
+        declared: list[Declaration] = []
+        for d in model.declarations:
+            if d.dimensions and not d.prefixes & _CONSTANT and self.kind(d.type) not in _TEXTS:
+                sizes = [self.interpreter.constant(n) for n in d.dimensions]
+                declared += located(model.name, d.line, lambda d, n: list(entries_of(d, n, is_array)), d, sizes)
+            else:
+                declared.append(d)
+        equations, initial = (unrolled(s, values_of) for s in (model.equations, model.initial_equations))
+        return model._replace(declarations=tuple(declared), equations=equations, initial_equations=initial)
 
     def evaluate(self, e: Expression) -> Value:
         return self.interpreter.evaluate(e)
-
-    @contextlib.contextmanager
-    def at_event(self) -> Iterator[None]:
-        """Within it, values are evaluated that an event writes."""
-        self.in_action = True
-        try:
-            yield
-        finally:
-            self.in_action = False
 
     def is_discrete(self, name: str) -> bool:
         """True for variables that change at events only."""
@@ -113,7 +141,7 @@ class Scope:
         return self.kind(c.made_of) if c.made_of is not None else name
 
     def value(self, name: str) -> Value:
-        known = self._known_of(name)
+        known = self.final if self.as_numbers else self.known
         if name in known:
             return known[name]
         d = self.declared.get(name)
@@ -123,23 +151,12 @@ class Scope:
             circle = " → ".join([*self.being[self.being.index(name) :], name])
             raise ModelError(f"the values of {circle} depend on each other")
         self.being.append(name)
-        before_action = self.in_action
-        self.in_action = known is self.known_at_events
         try:
             value = self._found(d)
         finally:
             self.being.pop()
-            self.in_action = before_action
         known[name] = value
         return value
-
-    def _known_of(self, name: str) -> dict[str, Value]:
-        """Where the value of a name is kept: what is an expression reads pre(m) in another way at events."""
-        if self.as_numbers:
-            return self.final
-        if not self.in_action or name in self.definitions.stored or not self.is_discrete(name):
-            return self.known
-        return self.known_at_events
 
     def _found(self, d: Declaration) -> Value:
         if d.prefixes & _CONSTANT:
@@ -224,6 +241,8 @@ class Scope:
             is_declared = d.name in self.component.variables
             signal = VariableSymbol(d.name) if is_declared else self.component.input(d.name)
             return sympy.Gt(signal, 0.5) if self.kind(d.type) == "Boolean" else sympy.floor(signal + 0.5)
+        if found is None and "input" not in d.prefixes:
+            raise ModelError(f"line {d.line}: nothing determines '{d.name}': it has neither an equation nor a when")
         if found is None:  # an input of the model that nothing drives
             start = self._start(d.modifiers.get("start")) or self._least(d.type)
             return bool(start) if self.kind(d.type) == "Boolean" else int(start)
@@ -232,15 +251,18 @@ class Scope:
     def defined(self, name: str, found: Value) -> Value:
         if isinstance(found, int):  # the number of an algorithm
             values = self.algorithm(found)
-            known = self._known_of(name)
-            known.update({k: v for k, v in values.items() if k not in known})
+            self.known.update({k: v for k, v in values.items() if k not in self.known})
             return values[name]
         return self.evaluate(found)
 
     def algorithm(self, number: int) -> dict[str, Value]:
         """What an algorithm assigns."""
-        stored = {n: self.stored(n) for n in self.definitions.assigned[number] if n in self.definitions.stored}
-        return self.interpreter.assigned_by(self.definitions.algorithms[number], stored)
+        if number not in self.carried_out:
+            assigned, kept = self.definitions.assigned[number], self.definitions.stored
+            stored = {n: previous(self.stored(n)) for n in assigned if n in kept}
+            statements = self.definitions.algorithms[number]
+            self.carried_out[number] = self.interpreter.assigned_by(statements, stored)
+        return self.carried_out[number]
 
     # --- declarations ------------------------------------------------------------------------------------------------
 
@@ -287,7 +309,13 @@ class Scope:
         start = self._start(d.modifiers.get("start"))
         start = self._least(d.type) if start is None else as_number(start)
         self.component.discrete(d.name, start=start)
+        self.hidden(previous(DiscreteSymbol(d.name)).path, 0)
         return self.stored(d.name)
+
+    def hidden(self, name: str, start: float) -> DiscreteSymbol:
+        """Declares a discrete variable that is not the text's."""
+        self.component.discrete(name, start=start)
+        return DiscreteSymbol(name)
 
     def _least(self, type_name: str) -> int:
         """What a discrete variable starts at if nothing says so: an enumeration at its first literal, others at 0."""
@@ -327,7 +355,7 @@ class Scope:
         value = self.evaluate(e)
         if is_condition(value):
             value = as_number(value)
-        if isinstance(value, sympy.Expr) and any(not isinstance(s, ParameterSymbol) for s in value.free_symbols):
+        if isinstance(value, sympy.Expr) and any(not isinstance(s, ParameterSymbol) for s in symbols_of(value)):
             return None
         return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
@@ -335,10 +363,6 @@ class Scope:
         """A hidden parameter or variable that is equal to an expression of a function."""
         if e in self.names:
             return self.names[e]
-        symbols = e.free_symbols
-        known_before = PreviousSymbol | DiscreteSymbol if self.in_action else PreviousSymbol
-        if any(isinstance(s, known_before) for s in symbols):  # a variable would have the value of another side
-            return e
         name = f":value[{len(self.names)}]"
         if _is_of_parameters(e):
             self.names[e] = self.component.parameter(name, e)
@@ -361,42 +385,46 @@ class Scope:
 
     def _read_table(self, read: Callable[..., Value], table: Table, column: int, u: Value, *more: Value) -> Value:
         """The value of a table. One without extrapolation ends the run where it is read outside of its rows."""
-        outside = table.outside(u) if isinstance(u, sympy.Expr) and not self.in_action else False
+        outside = table.outside(u) if isinstance(u, sympy.Expr) else False
         outside = functools.reduce(both, self.interpreter.guards, outside)
         if not isinstance(outside, bool) and outside not in self.ends and outside.atoms(VariableSymbol, TimeSymbol):
             self.ends.add(outside)
             first, last = table.rows[0, 0] + table.shift, table.rows[-1, 0] + table.shift
             told = f"a table is read outside of [{first:g}, {last:g}], without extrapolation"
-            self.component.when(self.kept.in_events(outside), terminate(told), at_start=True)
+            self.component.when(self.kept.in_discrete(outside), terminate(told), at_start=True)
         return read(table, column, u, *more)
 
     def _pre(self, e: Expression) -> Value:
-        value = self.evaluate(e)
-        if not self.in_action:
-            return value  # between events the value before is the present one
-        return before(value)
+        return previous(self.evaluate(e))
 
     def _edge(self, e: Expression) -> Value:
         now = self.evaluate(e)
-        return both(now, negated(before(now))) if self.in_action else now
+        return both(now, negated(previous(now)))
 
     def _change(self, e: Expression) -> Value:
         now = self.evaluate(e)
-        return negated(plain(sympy.Eq(as_number(now), as_number(before(now)))))
+        return negated(plain(sympy.Eq(as_number(now), as_number(previous(now)))))
 
-    def at_start(self) -> Value:
-        """The condition that holds at the initial time, until all modes have settled."""
+    def phase(self, number: int) -> Condition:
+        """The condition that the initial time is so far: `STARTING`, `AT_FIRST` or `STARTED`."""
         if self.initial is None:
-            self.component.discrete(":initial", start=1)
-            self.initial = DiscreteSymbol(":initial")
-        return sympy.Eq(self.initial, 1)
+            self.initial = self.hidden(":initial", STARTING)
+        return sympy.Eq(self.initial, number)
+
+    def _is_initial(self) -> Value:
+        return negated(self.phase(STARTED))
 
     def _sample(self, start: Expression, interval: Expression) -> Value:
-        return self.component.sampled(self.evaluate(interval), self.evaluate(start))
+        """True in the first iteration at a tick, but not at the initial time before it has settled."""
+        clock = self.component.sampled(self.evaluate(interval), self.evaluate(start))
+        if clock not in self.ticks:
+            tick = self.ticks[clock] = self.hidden(f":tick[{len(self.ticks)}]", 0)
+            self.component._event(clock, (Assign(tick, sympy.Integer(1)),), None, NO_FLAG)
+        return both(sympy.Eq(self.ticks[clock], 1), self.phase(STARTED))
 
 
 def _is_of_parameters(value: sympy.Expr) -> bool:
-    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in value.free_symbols)
+    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols_of(value))
 
 
 T = TypeVar("T")
@@ -430,8 +458,21 @@ def _gather(names: Iterable[str]) -> tuple[dict[str, list[tuple[int, ...]]], dic
     return {k: list(v) for k, v in entries.items()}, {k: list(v) for k, v in fields.items()}
 
 
-def before(value: Value) -> Value:
-    """A value before the event."""
+def previous(value: Value) -> Value:
+    """A value, or a discrete variable, in the iteration before."""
+    if isinstance(value, list):
+        return [previous(v) for v in value]
+    if isinstance(value, Record):
+        return Record({k: previous(v) for k, v in value.items()})
     if not isinstance(value, sympy.Basic):
         return value
-    return value.xreplace({s: PreviousSymbol(s.path) for s in value.free_symbols if isinstance(s, DiscreteSymbol)})
+    found = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
+    return value.xreplace({s: DiscreteSymbol(f":pre({n})") for s, n in found.items() if not n.startswith(":")})
+
+
+def present(value: Value) -> Value:
+    """A value with what it reads of the iteration before as it is now: at the initial time they are the same."""
+    if not isinstance(value, sympy.Basic):
+        return value
+    names = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
+    return value.xreplace({s: DiscreteSymbol(n[5:-1]) for s, n in names.items() if n.startswith(":pre(")})

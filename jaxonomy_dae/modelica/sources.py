@@ -168,6 +168,14 @@ class Sources:
             return found
         return Found(found.source, f"{of.path}.{name}", (of, *found.scopes, *of.scopes), found.changes)
 
+    def declared(self, of: Found) -> Iterator[Declaration]:
+        """The declarations of a class, inherited ones among them."""
+        yield from of.source.declarations
+        for base, _ in of.source.bases:
+            target = self.class_of(base, of.scopes)
+            if target is not None:
+                yield from self.declared(target)
+
     def inherited_class(self, found: Found) -> Found | None:
         """What `redeclare function extends f` continues: f as the bases of its package have it."""
         name, reached = found.source.name, found.scopes[0]

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 import sympy
 
 from ..base.errors import ModelError
-from ..write.events import assign
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
 from .continuous import equal, pairs, side_by_side
 from .definitions import assigned_in, with_entries
-from .scope import Scope
+from .scope import Scope, present
 from .tree import Branches, Call, Equality, Reference, Statement, each_part
 from .values import Value, as_number, is_condition
 
@@ -67,12 +66,18 @@ def write_initial_algorithm(scope: Scope, statements: tuple[Statement, ...]) -> 
 def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     """A start, where one side is a variable and the other is known beforehand; otherwise an equation at the start."""
     c = scope.component
-    left, right = _unwrapped(left), _unwrapped(right)
+    left, right = present(_unwrapped(left)), present(_unwrapped(right))
+    if _is_same(left, right):
+        return
+    if _waits(scope, left, right) or _waits(scope, right, left):
+        scope.waiting.append((left, right))
+        return
     for a, b in ((left, right), (right, left)):
         known = _in_parameters(b)
-        if isinstance(a, DiscreteSymbol):
+        if isinstance(a, DiscreteSymbol) and a not in scope.said:
+            scope.said.add(a)
             if isinstance(b, sympy.Basic) and any(isinstance(s, VariableSymbol) for s in b.free_symbols):
-                c.when(scope.at_start(), assign(a, b), at_start=True)
+                scope.initially[a] = b
             else:
                 c.parameters[a.path] = c.parameters[a.path].with_value(
                     _plain(b) if known else float(_numerical(scope, b))
@@ -93,6 +98,27 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     a, b = (float(_numerical(scope, sympy.sympify(side))) for side in (left, right))
     if not math.isclose(a, b):  # a text has up to sixteen digits
         raise ModelError(f"the initial equation {left} = {right} does not hold for the declared starts")
+
+
+def _is_same(left: Value, right: Value) -> bool:
+    return isinstance(left, sympy.Basic) and left == right
+
+
+def _waits(scope: Scope, a: Value, b: Value) -> bool:
+    """True for a discrete variable that is what another one is, of which nothing is said yet."""
+    found = b.free_symbols if isinstance(b, sympy.Basic) else set()
+    unsaid = any(isinstance(s, DiscreteSymbol) and s not in scope.said for s in found)
+    return scope.postpones and isinstance(a, DiscreteSymbol) and unsaid
+
+
+def hold_waiting(scope: Scope) -> None:
+    """Holds what initial equations say of discrete variables in terms of others, each after these; what is said of none
+    of them counts as declared."""
+    while scope.waiting:
+        before, scope.waiting = scope.waiting, []
+        for left, right in before:
+            _hold_initially(scope, left, right)
+        scope.postpones = len(scope.waiting) < len(before)
 
 
 def _numerical(scope: Scope, value: Value) -> Value:

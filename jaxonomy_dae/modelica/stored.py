@@ -10,7 +10,7 @@ from . import tree
 from .flat_model import FlatModel
 from .open_class import OpenClass, OpenPort
 
-FORMAT = 1  # to be raised with every change of what stands in these records
+FORMAT = 2  # to be raised with every change of what stands in these records
 _TREE = (
     tree.Number, tree.Truth, tree.Text, tree.Reference, tree.Whole, tree.End, tree.Call, tree.Unary, tree.Binary,
     tree.Choice, tree.Array, tree.Matrix, tree.Several, tree.Range, tree.Comprehension, tree.Part, tree.Equality,
@@ -26,7 +26,7 @@ def written(c: OpenClass) -> dict[str, Any]:
     return {
         "format": FORMAT,
         **{name: list(value) if isinstance(value, tuple) else value for name, value in fields.items()},
-        "ports": [[p.name, p.potentials, p.flows] for p in c.ports],
+        "ports": [[p.name, p.potentials, p.flows, p.streams, p.orientation] for p in c.ports],
         "model": _written(c.flat.model),
         "classes": [_written(each) for each in c.flat.classes.values()],
     }
@@ -44,14 +44,20 @@ def read(data: Any) -> OpenClass:
         raise ModelError(f"this is no class of format {FORMAT}: it has format {found!r}")
     try:
         classes = {c.name: c for c in map(_read, data["classes"])}
-        pairs = [(name, *(tuple(map(tuple, side)) for side in sides)) for name, *sides in data["ports"]]
-        names = {key: tuple(data[key]) for key in ("inputs", "outputs", "tunable", "required", "fixed")}
+        names = {key: tuple(data[key]) for key in ("inputs", "outputs", "tunable", "required", "fixed", "roots")}
+        names["branches"] = tuple(map(tuple, data["branches"]))
         return OpenClass(
             data["name"], data["description"], FlatModel(_read(data["model"]), classes),
-            tuple(OpenPort(*each) for each in pairs), **names,
+            tuple(map(_port, data["ports"])), **names,
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise ModelError(f"the record of a class is damaged ({type(error).__name__}: {error}); write it anew") from None
+
+
+def _port(data: list[Any]) -> OpenPort:
+    name, *sides, orientation = data
+    potentials, flows, streams = (tuple(map(tuple, side)) for side in sides)
+    return OpenPort(name, potentials, flows, streams, tuple(orientation))
 
 
 def _written(x: Any) -> Any:

@@ -16,9 +16,12 @@ from .neural import NeuralDAEBlock as NeuralDAEBlock
 from .ports import Domain as Domain
 from .ports import Electrical as Electrical
 from .ports import Hydraulic as Hydraulic
+from .ports import Overdetermined as Overdetermined
 from .ports import Planar as Planar
 from .ports import Rotational as Rotational
 from .ports import Thermal as Thermal
 from .ports import Translational as Translational
+from .streams import actual_stream as actual_stream
+from .streams import in_stream as in_stream
 from .symbols import Eq as Eq
 from .symbols import der as der

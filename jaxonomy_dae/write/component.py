@@ -1,7 +1,7 @@
 """The base class of everything a user models with."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -71,6 +71,8 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         self.as_written: dict[sympy.Expr, sympy.Expr] = {}
         self.held_branches: list[HeldBranch] = []
         self.accounts: list[Account] = []
+        self.tree_branches: list[tuple[Port, Port]] = []  # whose overdetermined quantities the equations relate
+        self.tree_roots: list[Port] = []  # whose overdetermined quantities the equations determine
         self._line = line_of_caller()
         self._lines: dict[sympy.Expr, str] = {}  # of equations that were written on lines of their own
         self._sealed = False
@@ -332,16 +334,31 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         self.add_equations(sympy.Eq(symbol, expr, evaluate=False))
         return symbol
 
-    def port(self, name: str, domain: Domain) -> Port:
-        """Declares a port of the given domain; returns it, with its variables as attributes."""
+    def port(self, name: str, domain: Domain, nominal: Mapping[str, float] | None = None) -> Port:
+        """Declares a port of the given domain; returns it, with its variables as attributes.
+
+        `nominal` gives the usual sizes of some of them, by name: `{"m_flow": 1e-6}`. Where streams meet, a flow far
+        below that counts as none.
+        """
         self._claim(name, "port")
         if not isinstance(domain, Domain):
             raise ModelError(f"port '{self.name}.{name}' needs a Domain such as Electrical; got {domain!r}")
         port = Port(self, name, domain)
         self.ports[name] = port
-        for variable, unit in (*domain.across, *domain.through):
-            self._declare(f"{name}.{variable}", "port", unit=unit)
+        for variable, unit in domain.variables:
+            self._declare(f"{name}.{variable}", "port", unit=unit, nominal=(nominal or {}).get(variable))
         return port
+
+    def declare_branch(self, a: Port, b: Port) -> None:
+        """Says that the equations determine the overdetermined quantities of one port from those of the other."""
+        self._check_open("say which of its ports are branches")
+        self.tree_branches.append((a, b))
+
+    def declare_root(self, port: Port) -> None:
+        """Says that the equations determine the overdetermined quantities of the port: a tree of connections begins
+        there."""
+        self._check_open("say which of its ports are roots")
+        self.tree_roots.append(port)
 
     def learned(
         self,
@@ -509,6 +526,7 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
 _BASE_ATTRIBUTES = (
     *"ev name parent parameters variables ports children equations".split(),
     *"learned_terms connections signals events relations as_written held_branches accounts".split(),
+    *"tree_branches tree_roots".split(),
     *"_line _lines _sealed".split(),
 )
 

@@ -189,6 +189,8 @@ class EventDeclarations:
             value = _with_new_values(action.value, new, (), where)
             if value.is_number:
                 values.append(float(value))
+            elif isinstance(value, VariableSymbol) and value.path.startswith(":when"):  # it stands for a value already
+                values.append(value.path)
             else:
                 values.append(self._hidden(f":when[{number},{k}]", value))
         return tuple(values)

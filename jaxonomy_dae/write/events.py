@@ -25,6 +25,8 @@ class EventFlag(enum.Flag):
     - `KINK`: equations go on with the same values where it happens; only their derivatives jump.
     - `STRICT`: its condition is false where its guard is zero.
     - `STRIKE`: it closes a contact, at once with others that close at the same instant.
+    - `REPEATED`: it happens again at its instant for as long as its condition holds.
+    - `LAST`: it waits until no other event of its instant is left; all that have waited happen at once.
     """
 
     LISTED = enum.auto()
@@ -34,6 +36,8 @@ class EventFlag(enum.Flag):
     KINK = enum.auto()
     STRICT = enum.auto()
     STRIKE = enum.auto()
+    REPEATED = enum.auto()
+    LAST = enum.auto()
 
 
 NO_FLAG = EventFlag(0)

@@ -1,15 +1,20 @@
 """How a component declares equations that change: branches and complementary pairs."""
 
+from collections.abc import Mapping
+
 import sympy
 
 from ..base.aliases import Condition, Expression
 from ..base.errors import ModelError
-from .declarations import Value
+from .declarations import Parameter, Value, Variable
 from .equations import zero_of
-from .events import Assign, EventFlag, HeldBranch, relation_in_discretes
+from .events import NO_FLAG, Assign, EventFlag, HeldBranch, Terminate, relation_in_discretes
 from .relation_declarations import RelationDeclarations
 from .symbols import DiscreteSymbol, RelationSymbol, der
 
+# Modes of `sliding` at an instant, beside 1, −1 and 0: the solution begins somewhere, may be on the surface and reads
+# the field above it or below it, or leaves it to above if the field below does not lead away, too.
+_ON_IT, _ABOVE_IS_TRIED, _BELOW_IS_TRIED, _LEAVES_ABOVE = 3, -2, 2, 4
 HIGHEST = 2  # the most often that a branch may have to be differentiated: what holds positions back
 
 
@@ -17,6 +22,10 @@ class ModeDeclarations(RelationDeclarations):
     """The part of `Component` that concerns equations of which events choose one."""
 
     held_branches: list[HeldBranch]
+    parameters: dict[str, Parameter]
+    variables: dict[str, Variable]
+    ports: Mapping[str, object]
+    children: Mapping[str, object]
 
     def either(self, mode: sympy.Basic, then: Value, otherwise: Value, order: int = 0) -> None:
         """Adds an equation with two branches: `then` is zero while the mode holds, `otherwise` is zero while it does
@@ -42,8 +51,69 @@ class ModeDeclarations(RelationDeclarations):
         """
         self._either(relation_in_discretes(mode, f"component '{self.name}': either"), then, otherwise, order, None)
 
+    def sliding(self, surface: Value, above: Value, below: Value, name: str | None = None) -> DiscreteSymbol:
+        """Adds an equation that jumps at a surface, and along which a solution may slide: `above` is zero where
+        surface > 0, `below` is zero where surface < 0. Where both lead back to the surface, the solution stays on it
+        with the mixture a·above + (1 − a)·below = 0, 0 ≤ a ≤ 1, that keeps it there (Filippov 1988, *Differential
+        equations with discontinuous righthand sides*, section 4), and leaves it where a reaches 0 or 1.
+
+        ```python
+        self.sliding(x, u - 1, u + 1)                    # u = sign(x), in der(x) = 0.5·sin(t) − u
+        self.sliding(v, f - mu * n, f + mu * n)          # dry friction
+        self.sliding(s, a - 1, a)                        # of two fields: der(x) = a·f + (1 − a)·g, …
+        ```
+
+        **Arguments:**
+
+        - `surface`: an expression in states whose first derivative depends on what `above` and `below` determine.
+        - `above`, `below`: expressions that are zero, or SymPy `Eq`s; linear in what they determine.
+        - `name`: of the discrete variable that says where the solution is. None: `side`, and `side2`, `side3`, … for
+            further ones of this component.
+
+        A solution that crosses the surface, as both fields lead to one side, crosses at once. One that begins on it
+        slides, or goes where both fields lead. If they lead away to both sides, the run ends there and says so: it has
+        more than one solution.
+
+        **Returns:**
+
+        The discrete variable: 1 above, −1 below, 0 on the surface.
+
+        **Raises:**
+
+        - `ModelError` for what is not an expression.
+        """
+        where = f"component '{self.name}': sliding:"
+        surface, above, below = (_expression(zero_of(e), where) for e in (surface, above, below))
+        side = self.discrete(self._free_name("side") if name is None else name, start=_ON_IT, unit="1")
+        tried = tuple((above, sympy.Eq(side, mode)) for mode in (_ON_IT, 1, _ABOVE_IS_TRIED))
+        branch = sympy.Piecewise(*tried, (below, True))
+        self._either(sympy.Eq(side, 0), surface, branch, 1, None)
+        rate, part = der(surface), below / (below - above)
+
+        def moves(condition: Condition, mode: int, to: Value, flags: EventFlag = NO_FLAG) -> None:
+            """Declares an event that takes one mode to another."""
+            on: Condition = sympy.Eq(side, mode)
+            self._event(condition, (Assign(side, sympy.sympify(to)),), on, flags)
+
+        first = sympy.Piecewise((1, surface > 0), (-1, surface < 0), (_ABOVE_IS_TRIED, True))
+        moves(sympy.Eq(side, _ON_IT), _ON_IT, first, EventFlag.AT_START)
+        # Who arrives reads the field of the other side, and slides if that leads back.
+        moves(surface <= 0, 1, _BELOW_IS_TRIED, EventFlag.LISTED)
+        moves(surface >= 0, -1, _ABOVE_IS_TRIED, EventFlag.LISTED)
+        moves(rate < 0, _ABOVE_IS_TRIED, _BELOW_IS_TRIED)
+        moves(rate >= 0, _ABOVE_IS_TRIED, _LEAVES_ABOVE)
+        moves(rate > 0, _BELOW_IS_TRIED, 0)
+        moves(rate <= 0, _BELOW_IS_TRIED, -1)
+        moves(rate >= 0, _LEAVES_ABOVE, 1)
+        both = f"on the surface {surface} = 0 of component '{self.name}', both fields lead away: begin beside it"
+        leaves: Condition = sympy.Eq(side, _LEAVES_ABOVE)
+        self._event(rate < 0, (Terminate(both),), leaves, EventFlag.LISTED)
+        moves(part >= 1, 0, 1, EventFlag.LISTED)
+        moves(part <= 0, 0, -1, EventFlag.LISTED)
+        return side
+
     def complementary(
-        self, gap: Value, force: Value, name: str = "active", order: int = 0, restitution: Value | None = None,
+        self, gap: Value, force: Value, name: str | None = None, order: int = 0, restitution: Value | None = None,
         rest_speed: Value = 0.0, clearance: Value = 1e-9, start: Value = 0,
     ) -> DiscreteSymbol:  # fmt: skip
         """Adds gap ≥ 0, force ≥ 0 and gap·force = 0: one of the two is zero, and the other is not negative.
@@ -55,7 +125,8 @@ class ModeDeclarations(RelationDeclarations):
 
         - `gap`, `force`: expressions. With `order=0`, both of algebraic variables or of derivatives, not of states.
         - `name`: of the discrete variable that says which one is zero: 1 while the gap is, 0 while the force is. With
-            `order=0` it becomes at the initial time what the equations ask for.
+            `order=0` it becomes at the initial time what the equations ask for. None: `active`, and `active2`,
+            `active3`, … for further ones of this component.
         - `order`: how many times the gap must be differentiated to determine the force, as in `either`: 2 if it is
             between positions. When such a gap closes, the speed at which it closes is taken away by an impulse.
         - `restitution`: with `order=2`, what part of that speed is given back: while restitution times the speed is
@@ -79,7 +150,7 @@ class ModeDeclarations(RelationDeclarations):
                 f"component '{self.name}': complementary: a restitution is for gaps between positions, order=2; got "
                 f"order={order}"
             )
-        active = self.discrete(name, start=start, unit="1")
+        active = self.discrete(self._free_name("active") if name is None else name, start=start, unit="1")
         closed: Condition = sympy.Eq(active, 1)
         open_: Condition = sympy.Eq(active, 0)
         impulse = self._either(closed, gap, force, order, active)
@@ -108,6 +179,11 @@ class ModeDeclarations(RelationDeclarations):
         low: Condition = sympy.Ne(lifted, 1)
         self._event(gap >= clearance, (Assign(lifted, yes),), sympy.And(open_, low), EventFlag.AT_START)
         return active
+
+    def _free_name(self, name: str) -> str:
+        """The name, with a number behind it if the component has declared it."""
+        taken = {*self.parameters, *self.variables, *self.ports, *self.children}
+        return next(n for n in (name, *(f"{name}{k}" for k in range(2, len(taken) + 3))) if n not in taken)
 
     def _either(
         self, condition: Condition, then: Expression, otherwise: Expression, order: int, pushes: DiscreteSymbol | None

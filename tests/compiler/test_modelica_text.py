@@ -1,6 +1,7 @@
 """Reading Base Modelica, and what its expressions become: no model is compiled here."""
 
 import math
+import re
 
 import equinox as eqx
 import numpy as np
@@ -17,6 +18,7 @@ from jaxonomy_dae.modelica.random_numbers import GENERATORS, number
 from jaxonomy_dae.modelica.semi_linear import with_chains_solved
 from jaxonomy_dae.modelica.tables import Table, table_1d
 from jaxonomy_dae.modelica.tree import Binary, Call, Number, Reference, Unary
+from jaxonomy_dae.write.events import EventFlag
 from jaxonomy_dae.write.symbols import VariableSymbol
 
 
@@ -392,8 +394,8 @@ def built(text: str) -> FlatComponent:
 
 def test_names_stay_and_parameters_are_declared_where_they_are_read():
     ball = built(BALL)
-    assert {"h", "v"} <= set(ball.variables) and set(ball.parameters) == {"e", "bounces"}
-    assert ball.parameters["bounces"].is_discrete and len(ball.events) == 1
+    assert {"h", "v"} <= set(ball.variables) and {n for n in ball.parameters if n[0] != ":"} == {"e", "bounces"}
+    assert ball.parameters["bounces"].is_discrete
 
 
 def test_modes_are_discrete_variables_and_other_truths_are_expressions():
@@ -448,9 +450,16 @@ def test_the_value_before_the_start_of_what_is_not_kept_is_nothing():
     assert "x" in built(text).variables
 
 
-def actions_of(text: str) -> dict[str, str]:
-    (event,) = built(text).events
-    return {str(a.target): str(a.value) for a in event.actions}
+def values_of(text: str) -> dict[str, str]:
+    """What the discrete variables of a model become where their `when` acts, by name; `new(n)` is what n becomes."""
+    found = {}
+    for equation in built(text).equations:
+        for target in equation.free_symbols:
+            value = target - equation
+            if str(target).startswith(":when:new[") and target not in value.free_symbols:
+                acts = str(value.args[0][0]) if isinstance(value, sympy.Piecewise) else str(value)
+                found[str(target)[10:-1]] = re.sub(r":when:new\[(\w+)\]", r"new(\1)", acts).replace(":pre(", "pre(")
+    return found
 
 
 def test_an_algorithm_in_a_when_goes_on_from_the_values_before_it():
@@ -458,15 +467,14 @@ def test_an_algorithm_in_a_when_goes_on_from_the_values_before_it():
     text = """model m Integer n(start = 0); Integer k(start = 0); Integer j(start = 1); Real x;
       equation x = n + k + j;
       algorithm when time > 1.0 then n := n + 1; k := 2 * n; for i in 1:3 loop j := j * 2; end for; end when; end m;"""
-    found = actions_of(text)
-    assert found["n"] == "pre(n) + 1" and found["k"] == "2*n" and found["j"] == "8*pre(j)"
+    assert values_of(text) == {"n": "pre(n) + 1", "k": "2*new(n)", "j": "8*pre(j)"}
 
 
-def test_whens_with_one_condition_are_one_event():
+def test_whens_of_one_instant_read_each_other():
     """What one of them read was the value before, where the other one assigns it at the same instant."""
     text = """model m Integer k(start = 0); Real j(start = 0.0); Real x; equation x = k + j;
       when sample(0.0, 1.0) then j = 2.0 * k; end when; when sample(0.0, 1.0) then k = pre(k) + 1; end when; end m;"""
-    assert actions_of(text) == {"j": "2.0*k", "k": "pre(k) + 1"}
+    assert values_of(text) == {"j": "2.0*new(k)", "k": "pre(k) + 1"}
 
 
 def test_a_relation_with_a_choice_in_it():
@@ -476,7 +484,7 @@ def test_a_relation_with_a_choice_in_it():
     reads = " ".join(f"y{k} = b{k};" for k in range(1, 8))
     text = f"""model m Integer z; Real u; {names} equation u = sin(time); {reads}
       algorithm when time > 0.5 then z := if u > 0.0 then integer(u * 12.7 + 0.5) else 0; {bits} end when; end m;"""
-    assert len(actions_of(text)) == 8
+    assert len(values_of(text)) == 8
     text = """model m Real x; Real y; Real u; equation u = sin(time);
       x = if (if u > 0.0 then u ^ 3 else -u) > 0.2 then 1.0 else 2.0;
       y = if time < (if time < 1.0 then 0.5 else 2.0) then 1.0 else 2.0; end m;"""
@@ -492,7 +500,27 @@ def test_at_a_tick_pre_is_the_value_before_it():
     """`pre(k) <> 0` beside a clock was the value that the tick gives to k: a circle."""
     text = """model m Integer k(start = -1); Integer j(start = 2); Real x; equation x = k + j;
       when pre(k) <> 0 and sample(0.0, 1.0) then k = pre(j); j = pre(j) - 1; end when; end m;"""
-    assert "Ne(pre(k), 0)" in actions_of(text)["k"]
+    assert values_of(text) == {"k": "pre(j)", "j": "pre(j) - 1"}
+    assert not any(EventFlag.LISTED in event.flags for event in built(text).events)
+
+
+@pytest.mark.parametrize(
+    ("equations", "told"),
+    [
+        ("when time > 1.0 then a = b; end when; when time > 2.0 then b = a; end when;", "a → b → a depend"),
+        (
+            "when time > 1.0 then a = 1; end when; when time > 2.0 then a = b; b = 2; end when;",
+            "'a' is assigned by two",
+        ),
+        ("when time > a then a = 1; end when; b = pre(b) + b;", "b → b depend"),
+        ("b = 1; algorithm if time > 1.0 then break; end if; a := 1;", "'break' stands outside of a loop"),
+        ("when time > a then a = 1; end when;", "nothing determines 'b'"),
+    ],
+)
+def test_discrete_equations_that_have_no_order_are_refused(equations, told):
+    with pytest.raises(ModelError) as error:
+        built(f"model m Integer a(start = 0); Integer b(start = 0); Real x; equation\nx = a + b; {equations} end m;")
+    assert told in str(error.value)
 
 
 def test_initial_equations_of_discrete_variables_follow_each_other():

@@ -96,7 +96,8 @@ def given():
         Discharging(ev, "back"),
     )
     values = {"x.x": 1.0, "y.y": 30.0, "pend.x": 0.6, "pend.vx": 1.6, "der(osc.mass.s)": 2.5}
-    return started(system, values | {"out.c.i": -0.5, "back.r.n.i": -0.5})
+    with pytest.warns(RuntimeWarning, match=r"starts are fixed in the model.*'pend\.y', 'pend\.vy'"):
+        return started(system, values | {"out.c.i": -0.5, "back.r.n.i": -0.5})
 
 
 def started(system, initial):
@@ -188,6 +189,16 @@ def test_values_given_outrank_starts_that_follow_from_others(given):
     """A pendulum given an x alone: y and the velocities follow, from the declared side of the circle."""
     found = given("pend.x", "pend.y", "pend.vx", "pend.vy")
     np.testing.assert_allclose(found, [0.6, -0.8, 1.6, 1.2], rtol=1e-10)  # x·vx + y·vy = 0
+
+
+def test_a_fixed_start_that_gives_way_is_named():
+    """A cubic with x fixed at 2: what is given for y moves x, unless it says the same."""
+    system = compiled(Cubic(EqnEnv(), "c", x_start=2.0, x_fixed=True))
+    with pytest.warns(RuntimeWarning, match=r"'c\.y' determines variables whose.*'c\.x' = 3, declared 2\."):
+        system.initialize(initial={"c.y": 30.0})
+    with pytest.warns(RuntimeWarning, match=r"'c\.y' determines variables whose.*: 'c\.x'\."):
+        jax.eval_shape(lambda y: system.initialize(initial={"c.y": y}), 30.0)
+    np.testing.assert_allclose(system.initialize(initial={"c.y": 10.0}), [2.0], rtol=1e-12)
 
 
 def test_a_derivative_may_be_given(given):
@@ -307,7 +318,8 @@ def test_guesses_of_what_is_no_state_count_as_much():
     for order in ("xy", "yx"):
         system = compiled(Coupled(EqnEnv(), "c", {n: {"x": 0.4, "y": 0.9}[n] for n in order}))
         assert len(system.states) == 1
-        found = system.observe(["c.x", "c.y"], 0.0, system.initialize())
+        with pytest.warns(RuntimeWarning, match=r"far from what is guessed: 'c\.[xy]' ="):
+            found = system.observe(["c.x", "c.y"], 0.0, system.initialize())
         np.testing.assert_allclose(found, [0.88, -0.06], rtol=1e-9)
 
 

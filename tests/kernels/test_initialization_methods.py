@@ -264,6 +264,7 @@ def test_a_run_from_an_inconsistent_start_is_no_success():
     assert okay.tolist() == [True, False, True]
 
 
+@pytest.mark.filterwarnings("ignore:initial=")
 @pytest.mark.parametrize(
     "solver", [optimistix.Dogleg, pytest.param(optimistix.LevenbergMarquardt, marks=pytest.mark.slow)]
 )
@@ -302,6 +303,7 @@ class Chain(Component):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the start is far")
 def test_a_chain_of_high_index_starts_one_block_after_the_other():
     """At rest λ₁ = g·y₁ and λ₁″ = 2|a|² + g·a_y, from λ₁ = |v|² + g·y₁; λ₂·L² = g·y₂ − L·L″ with L = 1 + λ₁/10."""
     g, y1, y2, y3 = 9.8, 0.9, 1.5, 0.5

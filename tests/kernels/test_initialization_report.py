@@ -271,6 +271,7 @@ def test_a_valve_opening_and_its_bounds():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:initial=")
 def test_two_parameters_from_two_values_on_a_constrained_model():
     """The mass and the length of a pendulum from its tension and its speed, at x = 0: 2·λ·L = m·(v²/L + g)."""
     system = pendulum(initial_theta=-np.pi / 2)

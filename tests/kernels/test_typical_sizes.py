@@ -3,10 +3,12 @@
 import jax
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from problems import compiled
-from sympy import Abs, Eq, exp, sign, sqrt
+from sympy import Abs, Eq, Piecewise, cos, exp, sign, sqrt
 
 from jaxonomy_dae import Component, EqnEnv, der
+from jaxonomy_dae.compile.model.natural_sizes import Factors
 
 
 class Branches(Component):
@@ -222,3 +224,34 @@ def test_a_start_tells_the_size_of_its_variable(amount, pressure, how):
     assert 0.7 < size_of(system, "c.n") / amount < 1.5
     found = float(system.observe("c.p", 0.0, system.initialize()))
     assert found == pytest.approx(pressure / 0.975, rel=1e-9)
+
+
+class Turning(Component):
+    """A crank of inertia J with friction at its slider, whose mode starts where there is none."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        phi, w = self.variable("phi", start=1.0, fixed=True), self.variable("w", start=0.0, fixed=True)
+        f, mode = self.variable("f"), self.discrete("mode", start=2)
+        self.add_equations(
+            Eq(der(phi), w),
+            Eq(0.02 * der(w), -cos(phi) * f),
+            Eq(f, Piecewise((0, Eq(mode, 2)), (30.0 * mode, True))),
+        )
+
+
+def test_a_branch_tells_a_size_before_its_mode_begins():
+    """The force was taken for 0.5 N, as the mode starts where it is zero."""
+    system = compiled(Turning(EqnEnv(), "c"))
+    force, speed = (float(system.typical_sizes[system.plan.resolve([name])[0][0]]) for name in ("c.f", "c.w"))
+    assert 0.1 < force / 30.0 < 10
+    assert 0.1 < speed / (30.0 / 0.02) ** 0.5 < 10  # one radian
+
+
+def test_sizes_that_only_errors_of_differences_tell():
+    """Powers are known to a few digits. In a crank that nothing drives, what was left of a singular value moved the
+    force by 950 decades."""
+    matrix = sp.csr_array([[1.0, -1.0], [1.0, -1.0 + 1e-5]])
+    found = Factors().least_squares(matrix, np.array([0.3, -0.2]))
+    assert np.abs(found).max() < 1.0
+    assert found[0] - found[1] == pytest.approx(0.05, abs=1e-3)  # which is told

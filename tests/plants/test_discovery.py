@@ -103,7 +103,8 @@ def test_twenty_seeds(problem, fit, noise, seeds, least, most):
     count = len(PROGRAMS)
     right, errors = 0, []
     for seed in seeds:
-        again = problem.fit(record(seed, noise), start=fit.system)
+        # One right model in fifty is doubted, and the first description of what is left over compiles a program.
+        again = problem.fit(record(seed, noise), start=fit.system, warn=False)
         found = again.discover("drag", powers(4))
         right += found.chosen.terms == first.chosen.terms
         single = next(c for c in found.candidates if c.terms == first.chosen.terms)

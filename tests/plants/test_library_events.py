@@ -17,13 +17,14 @@ import scipy.signal
 from component_references import checks, measured
 from diode_bridges import GOFF, RON, bridge_by_brute_force
 from problems import compiled
+from sympy import cos, sin
 
 import jaxonomy_dae.library.electrical as el
 import jaxonomy_dae.library.hydraulic as hyd
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.signal as sig
 import jaxonomy_dae.library.translational as line
-from jaxonomy_dae import EqnEnv, simulate
+from jaxonomy_dae import Component, Eq, EqnEnv, Rotational, Translational, simulate
 from jaxonomy_dae.library.friction import Brake, Clutch, OneWayClutch, StickingFriction
 
 TIGHT = dict(rtol=1e-10, atol=1e-10)
@@ -355,6 +356,39 @@ def rubbing():
     ts = np.unique([*den_hartog()[0], *FREE])
     names, inputs = ["m.s", "f.mode", "a.w", "b.w", "c.tau", "c.w_rel"], {"pull.u": SPEED, "drive.tau": jnp.sin}
     return ran(system, 12.0, ts, names, {}, inputs)
+
+
+class Yoke(Component):
+    """A scotch yoke: s = r·sin(φ)."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        a, b = self.port("a", Rotational), self.port("b", Translational)
+        r = self.parameter("r", 0.1)
+        self.add_equations(Eq(b.s, r * sin(a.phi)), Eq(a.tau + r * cos(a.phi) * b.f, 0))
+
+
+@pytest.mark.slow
+def test_friction_beyond_a_dead_centre():
+    """Where a yoke turns back its speed is zero, and its crank goes on. J·w²/2 is less by F times the way of the yoke,
+    r·(2 − sin φ) behind the first dead centre, whatever F is."""
+    ev = EqnEnv()
+    crank, yoke = rot.Inertia(ev, "crank", 0.02, initial_angle=0.0, initial_speed=20.0), Yoke(ev, "yoke")
+    wall, friction = line.FixedPosition(ev, "wall"), StickingFriction(ev, "f", 5.0)
+    system = compiled(
+        crank, yoke, wall, friction,
+        connect=[(crank.flange_b, yoke.a), (yoke.b, friction.flange_b), (friction.flange_a, wall.flange)],
+    )  # fmt: skip
+
+    @jax.value_and_grad
+    def energy(force):
+        run = simulate(system.with_parameters({"f.sliding": force}), 0.25, ts=jnp.array([0.25]), **TIGHT)
+        phi, w = run[["crank.phi", "crank.w"]][0]
+        return 0.01 * w**2 + force * 0.1 * (2 - jnp.sin(phi))
+
+    value, slope = energy(5.0)
+    assert float(value) == pytest.approx(4.0, rel=SMOOTH)
+    assert abs(float(slope)) < SMOOTH
 
 
 @pytest.mark.slow

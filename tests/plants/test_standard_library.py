@@ -4,6 +4,8 @@ Each plant stands for itself; those of one test share a diagram, a run and a gra
 folder of the library; without it the tests are skipped.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,16 @@ import scipy.integrate
 import scipy.optimize
 from device_library import standard_library
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae import (
+    AcausalCompiler,
+    AcausalDiagram,
+    Component,
+    Eq,
+    EqnEnv,
+    actual_stream,
+    der,
+    simulate,
+)
 from jaxonomy_dae.library import electrical, rotational, thermal, translational
 from jaxonomy_dae.library.signal import Constant
 from jaxonomy_dae.modelica import Library
@@ -238,3 +249,229 @@ def test_an_arm_of_three_dimensional_parts_on_our_damper(library):
     by_d = (phi(1.5, 0.3 + h) - phi(1.5, 0.3 - h))[-1] / (2 * h)
     assert slopes["arm.body.m"] == pytest.approx(by_m, rel=1e-4)
     assert slopes["damper.d"] == pytest.approx(by_d, rel=1e-4)
+
+
+BODIES = "Mechanics.MultiBody"
+
+
+def test_a_double_pendulum_of_bodies_and_our_damper(library):
+    """World, joints and bodies are components of their own; our damper acts between the links. The equations of
+    Lagrange in the angles of both links, by SciPy; slopes by differences."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    world = library.component(f"Modelica.{BODIES}.World", enableAnimation=False)(ev, "world")
+    first = opened(library, f"{BODIES}.Joints.Revolute")(ev, "first", start={"phi": 0.3, "w": 0.0})
+    Driven = library.component(f"Modelica.{BODIES}.Joints.Revolute", useAxisFlange=True)
+    second = Driven(ev, "second", start={"phi": 0.5, "w": 0.0})
+    link = opened(library, f"{BODIES}.Parts.FixedTranslation")(ev, "link", r=[0.7, 0.0, 0.0])
+    Body = opened(library, f"{BODIES}.Parts.Body")
+    upper = Body(ev, "upper", m=1.2, r_CM=[0.3, 0.0, 0.0], I_33=0.05)
+    lower = Body(ev, "lower", m=0.8, r_CM=[0.4, 0.0, 0.0], I_33=0.02)
+    damper, wall = rotational.Damper(ev, "damper", d=0.3), rotational.FixedAngle(ev, "wall")
+    d.add(world, first, second, link, upper, lower, damper, wall)
+    d.connect(world.frame_b, first.frame_a)
+    d.connect(first.frame_b, link.frame_a, upper.frame_a)
+    d.connect(link.frame_b, second.frame_a)
+    d.connect(second.frame_b, lower.frame_a)
+    d.connect(second.axis, damper.flange_a)
+    d.connect(damper.flange_b, wall.flange)
+    wanted = ["first.phi", "first.w", "second.phi", "second.w"]
+    system = AcausalCompiler(ev, d, state_selection="dummy_derivatives", prefer_states=wanted)()
+    assert system.states == wanted
+    values = {"upper.m": 1.2, "lower.m": 0.8, "link.r[1]": 0.7, "lower.I_33": 0.02, "damper.d": 0.3}
+    ts = np.array([0.4, 0.8, 1.2])
+    found, slopes = run_with_slopes(system, values, ts, ["first.phi", "second.phi"], ["first.phi", "second.phi"])
+
+    def swing(m1, m2, length, inertia, damping):
+        g, turned = 9.80665, 0.3 + np.array([0.0, 0.5])
+        a, b, c = 0.05 + m1 * 0.09 + m2 * length**2, m2 * length * 0.4, inertia + m2 * 0.16
+
+        def slope(t, x):
+            (one, two), (v, w) = x[:2], x[2:]
+            sin, cos, torque = np.sin(two - one), np.cos(two - one), damping * (w - v)
+            right = [
+                torque + b * sin * w**2 - (m1 * 0.3 + m2 * length) * g * np.cos(one),
+                -torque - b * sin * v**2 - m2 * 0.4 * g * np.cos(two),
+            ]
+            return [v, w, *np.linalg.solve([[a, b * cos], [b * cos, c]], right)]
+
+        run = scipy.integrate.solve_ivp(slope, (0.0, 1.2), [*turned, 0.0, 0.0], t_eval=ts, rtol=1e-11, atol=1e-12)
+        return np.array([run.y[0], run.y[1] - run.y[0]])
+
+    np.testing.assert_allclose([found["first.phi"], found["second.phi"]], swing(*values.values()), atol=1e-6)
+    for name, value in values.items():
+        up, down = (swing(*(values | {name: value + s * 1e-5}).values())[:, -1].sum() for s in (1, -1))
+        assert slopes[name] == pytest.approx((up - down) / 2e-5, rel=1e-4), name
+
+
+WATER = "redeclare package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater"
+
+
+class Tank(Component):
+    """A mass M of water of the specific enthalpy h under the pressure p + k M, with a port of the library's domain."""
+
+    def __init__(self, ev, name, port, M, h, k):
+        super().__init__(ev, name)
+        a = self.port("a", port.domain)
+        k, start, begin = self.parameter("k", k), self.parameter("h0", h), self.parameter("M0", M)
+        mass, h = self.variable("M", start=begin, fixed=True), self.variable("h", start=start, fixed=True)
+        self.add_equations(Eq(a.p, 1e5 + k * mass), Eq(a.h_outflow, h), Eq(der(mass), a.m_flow))
+        self.add_equations(Eq(mass * der(h), a.m_flow * (actual_stream(a, "h_outflow") - h)))
+
+
+def test_tanks_of_ours_behind_valves_of_the_library(library):
+    """Three tanks of water meet at a junction behind linear valves, m = dp m_nominal/dp_nominal. The flow out of one of
+    them turns. Masses and enthalpies by SciPy, with the mixture of what flows into the junction."""
+    Valve = library.component("Modelica.Fluid.Valves.ValveLinear", WATER)
+    ev, d = EqnEnv(), AcausalDiagram()
+    opening = Constant(ev, "opening", 0.5)
+    valves = [Valve(ev, f"v{k}", dp_nominal=1e4, m_flow_nominal=n) for k, n in enumerate([2.0, 1.0, 3.0])]
+    given = [(30.0, 1e5, 700.0), (10.0, 3e5, 1500.0), (12.0, 2e5, 400.0)]
+    tanks = [Tank(ev, f"t{k}", valves[0].port_a, *each) for k, each in enumerate(given)]
+    d.add(opening, *valves, *tanks)
+    for valve, tank in zip(valves, tanks, strict=True):
+        d.connect(tank.a, valve.port_a)
+        d.connect(opening.y, valve.opening)
+    d.connect(*(valve.port_b for valve in valves))
+    system = AcausalCompiler(ev, d)()
+    values = {"t0.M0": 30.0, "t1.h0": 3e5, "t2.k": 400.0, "v1.m_flow_nominal": 1.0}
+    ts = np.array([2.0, 10.0, 30.0])
+    names = [f"t{k}.{n}" for n in "Mh" for k in range(3)]
+    found, slopes = run_with_slopes(system, values, ts, names, names)
+
+    def reference(M0, h1, k2, nominal):
+        M, h, k = np.array([M0, 10.0, 12.0]), np.array([1e5, h1, 2e5]), np.array([700.0, 1500.0, k2])
+        G = 0.5 * np.array([2.0, nominal, 3.0]) / 1e4
+
+        def slope(t, x):
+            m = G * (k * x[:3] @ G / G.sum() - k * x[:3])  # into the tanks
+            leaving = np.maximum(-m, 0.0)
+            mixed = leaving @ x[3:] / max(leaving.sum(), 1e-300)
+            return [*m, *(np.maximum(m, 0.0) * (mixed - x[3:]) / x[:3])]
+
+        run = scipy.integrate.solve_ivp(slope, (0.0, 30.0), [*M, *h], t_eval=ts, rtol=1e-11, atol=1e-9, max_step=0.05)
+        return run.y
+
+    expected = reference(*values.values())
+    np.testing.assert_allclose([found[n] for n in names], expected, rtol=1e-6)
+    for name, value in values.items():
+        up, down = (reference(*(values | {name: value * (1 + s * 1e-4)}).values())[:, -1].sum() for s in (1, -1))
+        assert slopes[name] == pytest.approx((up - down) / (2e-4 * value), rel=1e-4), name
+
+
+# Classes by their closed forms: parameters, inputs of blocks, and the value of a variable at the time t. Blocks
+# have constant inputs u, u1, …; parts with two pins have 0.7 V across; heat flows from 350 K to 300 K; flanges are
+# held, b at 0.3 beyond a.
+V, HOT, COLD, APART = 0.7, 350.0, 300.0, 0.3
+BLOCKS = {
+    "Math.Gain": ({"k": 3.0}, [0.7], lambda t, u, k: k * u),
+    "Math.Add": ({"k1": 2.0, "k2": -3.0}, [0.7, 0.4], lambda t, u, w, k1, k2: k1 * u + k2 * w),
+    "Math.Add3": (
+        {"k1": 2.0, "k2": 0.5, "k3": 1.5}, [0.7, 0.4, 0.2],
+        lambda t, u, v, w, k1, k2, k3: k1 * u + k2 * v + k3 * w,
+    ),
+    "Math.Feedback": ({}, [0.7, 0.4], lambda t, u, w: u - w),
+    "Math.Product": ({}, [0.7, 0.4], lambda t, u, w: u * w),
+    "Math.Division": ({}, [0.7, 0.4], lambda t, u, w: u / w),
+    "Math.Max": ({}, [0.7, 0.4], lambda t, u, w: u),
+    "Math.Min": ({}, [0.7, 0.4], lambda t, u, w: w),
+    "Math.Abs": ({}, [-0.7], lambda t, u: -u),
+    "Math.Sqrt": ({}, [0.7], lambda t, u: jnp.sqrt(u)),
+    "Math.Sin": ({}, [0.7], lambda t, u: jnp.sin(u)),
+    "Math.Cos": ({}, [0.7], lambda t, u: jnp.cos(u)),
+    "Math.Tan": ({}, [0.7], lambda t, u: jnp.tan(u)),
+    "Math.Asin": ({}, [0.7], lambda t, u: jnp.arcsin(u)),
+    "Math.Acos": ({}, [0.7], lambda t, u: jnp.arccos(u)),
+    "Math.Atan": ({}, [0.7], lambda t, u: jnp.arctan(u)),
+    "Math.Atan2": ({}, [0.7, 0.4], lambda t, u, w: jnp.arctan2(u, w)),
+    "Math.Sinh": ({}, [0.7], lambda t, u: jnp.sinh(u)),
+    "Math.Cosh": ({}, [0.7], lambda t, u: jnp.cosh(u)),
+    "Math.Tanh": ({}, [0.7], lambda t, u: jnp.tanh(u)),
+    "Math.Exp": ({}, [0.7], lambda t, u: jnp.exp(u)),
+    "Math.Log": ({}, [0.7], lambda t, u: jnp.log(u)),
+    "Math.Log10": ({}, [0.7], lambda t, u: jnp.log10(u)),
+    "Math.UnitConversions.To_degC": ({}, [300.0], lambda t, u: u - 273.15),
+    "Math.UnitConversions.From_degC": ({}, [20.0], lambda t, u: u + 273.15),
+    "Math.UnitConversions.To_rpm": ({}, [0.7], lambda t, u: u * 30.0 / jnp.pi),
+    "Math.UnitConversions.From_rpm": ({}, [0.7], lambda t, u: u * jnp.pi / 30.0),
+    "Nonlinear.Limiter": ({"uMax": 0.5}, [0.7], lambda t, u, uMax: uMax),
+    "Nonlinear.DeadZone": ({"uMax": 0.5}, [0.7], lambda t, u, uMax: u - uMax),
+    "Continuous.Integrator": ({"k": 3.0}, [0.7], lambda t, u, k: k * u * t),
+    "Continuous.FirstOrder": ({"k": 3.0, "T": 0.5}, [0.7], lambda t, u, k, T: k * u * (1.0 - jnp.exp(-t / T))),
+    "Continuous.PI": ({"k": 3.0, "T": 0.5}, [0.7], lambda t, u, k, T: k * u * (1.0 + t / T)),
+}  # fmt: skip
+STARTS = {"Continuous.Integrator": "y", "Continuous.FirstOrder": "y", "Continuous.PI": "x"}
+PINS = {
+    "Basic.Resistor": ({"R": 2.0}, lambda t, R: V / R),
+    "Basic.Conductor": ({"G": 0.3}, lambda t, G: G * V),
+    "Basic.Inductor": ({"L": 0.4}, lambda t, L: V * t / L),
+    "Ideal.IdealDiode": (
+        {"Ron": 0.1, "Goff": 1e-3, "Vknee": 0.3},
+        lambda t, Ron, Goff, Vknee: (V - Vknee) / Ron + Goff * Vknee,
+    ),
+    "Semiconductors.Diode": (
+        {"Ids": 1e-6, "Vt": 0.05, "R": 50.0}, lambda t, Ids, Vt, R: Ids * (jnp.exp(V / Vt) - 1.0) + V / R
+    ),
+}  # fmt: skip
+HEATS = {
+    "ThermalConductor": ({"G": 0.3}, lambda t, G: G * (HOT - COLD)),
+    "ThermalResistor": ({"R": 2.0}, lambda t, R: (HOT - COLD) / R),
+}
+TURNED = {
+    "Spring": ({"c": 40.0, "phi_rel0": 0.1}, lambda t, c, phi_rel0: c * (APART - phi_rel0)),
+    "SpringDamper": ({"c": 40.0, "phi_rel0": 0.1, "d": 2.0}, lambda t, c, phi_rel0, d: c * (APART - phi_rel0)),
+}
+SHIFTED = {
+    "Spring": ({"c": 40.0, "s_rel0": 0.1}, lambda t, c, s_rel0: c * (APART - s_rel0)),
+    "SpringDamper": ({"c": 40.0, "s_rel0": 0.1, "d": 2.0}, lambda t, c, s_rel0, d: c * (APART - s_rel0)),
+}
+
+
+def test_classes_by_their_closed_forms(library):
+    """Forty-three classes, each with its derivatives by all of its parameters, and by time where it has a state."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    at: dict = {}  # of a component: the variable, the parameters, the closed form
+
+    def part(path, parameters, variable, form, **more):
+        name = f"c{len(at)}"
+        x = opened(library, path)(ev, name, **parameters, **more)
+        d.add(x)
+        at[name] = f"{name}.{variable}", parameters, form
+        return x
+
+    for path, (parameters, inputs, form) in BLOCKS.items():
+        start = {"start": {STARTS[path]: 0.0}} if path in STARTS else {}
+        given = functools.partial(lambda form, inputs, t, **p: form(t, *inputs, **p), form, inputs)
+        x = part(f"Blocks.{path}", parameters, "y", given, **start)
+        for k, value in enumerate(inputs):
+            u = Constant(ev, f"{x.name}u{k}", value)
+            d.add(u)
+            d.connect(u.y, x[f"u{k + 1}" if len(inputs) > 1 else "u"])
+    v, g = electrical.VoltageSource(ev, "v", V=V), electrical.Ground(ev, "g")
+    d.add(v, g)
+    pins = [
+        part(f"Electrical.Analog.{path}", parameters, "i", form, **({"start": {"i": 0.0}} if "Ind" in path else {}))
+        for path, (parameters, form) in PINS.items()
+    ]
+    d.connect(v.p, *(x.p for x in pins))
+    d.connect(v.n, g.p, *(x.n for x in pins))
+    hot, cold = thermal.FixedTemperature(ev, "hot", HOT), thermal.FixedTemperature(ev, "cold", COLD)
+    heats = [part(f"Thermal.HeatTransfer.Components.{path}", p, "Q_flow", form) for path, (p, form) in HEATS.items()]
+    d.connect(hot.heat, *(x.port_a for x in heats))
+    d.connect(cold.heat, *(x.port_b for x in heats))
+    a, b = rotational.FixedAngle(ev, "a", 0.0), rotational.FixedAngle(ev, "b", APART)
+    turned = [part(f"Mechanics.Rotational.Components.{path}", p, "tau", form) for path, (p, form) in TURNED.items()]
+    d.connect(a.flange, *(x.flange_a for x in turned))
+    d.connect(b.flange, *(x.flange_b for x in turned))
+    e, f = translational.FixedPosition(ev, "e", 0.0), translational.FixedPosition(ev, "f", APART)
+    shifted = [part(f"Mechanics.Translational.Components.{path}", p, "f", form) for path, (p, form) in SHIFTED.items()]
+    d.connect(e.flange, *(x.flange_a for x in shifted))
+    d.connect(f.flange, *(x.flange_b for x in shifted))
+    system = AcausalCompiler(ev, d)()
+    values = {f"{name}.{p}": value for name, (_, parameters, _) in at.items() for p, value in parameters.items()}
+    names, ts = [variable for variable, _, _ in at.values()], np.array([0.3, 0.8])
+    found, slopes = run_with_slopes(system, values, ts, names, names)
+    for name, (variable, parameters, form) in at.items():
+        np.testing.assert_allclose(found[variable], [form(t, **parameters) for t in ts], rtol=1e-7, err_msg=variable)
+        by_hand = jax.grad(lambda p, form=form: jnp.asarray(form(0.8, **p), float))(parameters)
+        for p, expected in by_hand.items():
+            assert slopes[f"{name}.{p}"] == pytest.approx(float(expected), rel=1e-5, abs=1e-9), (variable, p)

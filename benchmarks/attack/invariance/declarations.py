@@ -190,12 +190,32 @@ def relation(level: float) -> Callable:
     return write
 
 
-def ports(domain: Any, name: str = "p") -> Callable:
+def ports(domain: Any, name: str = "p", **given: Any) -> Callable:
     def write(self):
-        self.port(name, domain)
+        self.port(name, domain, **given)
         x = self.variable("x", start=1.0, fixed=True)
         across = self["p.v" if domain is Electrical else "p.T"] if name == "p" else self["q.v"]
         self.add_equations(Eq(der(x), -x), Eq(across, x))
+
+    return write
+
+
+def tree(root: int = 0, a: int = 0, b: int = 2) -> Callable:
+    def write(self):
+        joined = [self.port(name, Electrical) for name in "pqr"]
+        x = self.variable("x", start=1.0, fixed=True)
+        self.add_equations(Eq(der(x), -x), *(Eq(self[f"{name}.v"], x) for name in "pqr"))
+        self.declare_root(joined[root])
+        self.declare_branch(joined[a], joined[b])
+
+    return write
+
+
+def slides(surface: float = 1.0, above: float = 1.0, below: float = 1.0, **given: Any) -> Callable:
+    def write(self):
+        x, u = self.variable("x", start=1.0, fixed=True), self.variable("u")
+        self.add_equations(Eq(der(x), -u))
+        self.sliding(surface * x, u - above, u + below, **given)
 
     return write
 
@@ -295,6 +315,14 @@ PAIRS: dict[str, tuple[tuple[Any, Any], str]] = {
     "output.unit": (pair(outputs, "o", 2.0, unit=Two("m", "km")), STRUCTURE),
     "port.name": (pair(ports, Electrical, Two("p", "q")), STRUCTURE),
     "port.domain": (pair(ports, Two(Electrical, Thermal)), STRUCTURE),
+    "port.nominal": (pair(ports, Electrical, nominal=Two({"i": 1.0}, {"i": 1e-3})), STRUCTURE),
+    "declare_root.port": (pair(tree, root=Two(0, 1)), NOTHING),  # nothing is connected here
+    "declare_branch.a": (pair(tree, a=Two(0, 1)), NOTHING),
+    "declare_branch.b": (pair(tree, b=Two(2, 1)), NOTHING),
+    "sliding.surface": (pair(slides, surface=Two(1.0, 2.0)), STRUCTURE),
+    "sliding.above": (pair(slides, above=Two(1.0, 2.0)), STRUCTURE),
+    "sliding.below": (pair(slides, below=Two(1.0, 2.0)), STRUCTURE),
+    "sliding.name": (pair(slides, name=Two("side", "mode")), STRUCTURE),
     "learned.name": (pair(calls, "learned", Two("n", "m"), LAW, inputs=lambda s, self: [s.x]), STRUCTURE),
     "learned.network": (pair(calls, "learned", "n", Two(LAW, OTHER), inputs=lambda s, self: [s.x]), VALUE),
     # Networks' classes are told apart as nodes of JAX's trees, whatever they are called.

@@ -128,7 +128,7 @@ def plan_events(
 def _choices(table: EventTable, held: HeldTable) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Returns (the discrete values that `complementary` chooses, the guards that choose them). Contacts between states
     are left out: they close by impulses, and do not make equations singular."""
-    chooses = table.are(EventFlag.REVOCABLE) & ~table.are(EventFlag.RELATION)
+    chooses = table.are(EventFlag.REVOCABLE) & ~table.are(EventFlag.RELATION | EventFlag.REPEATED)
     chooses[table.event[np.isin(table.discrete, held.closed[held.closed >= 0])]] = False
     rows = chooses[table.event] & (table.discrete >= 0) & (table.event >= table.n_clocks)
     guards = table.event[rows] - table.n_clocks

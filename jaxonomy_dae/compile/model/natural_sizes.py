@@ -20,6 +20,7 @@ STEEPEST = 8.0  # power that an entry is taken for
 # Keeps sizes that nothing tells where they are. A size at the end of a chain of n links hangs on its beginning with a
 # singular value near 2/n, and of normal equations 1e-12 is left beside rounding.
 DAMPING = 1e-6
+STIFFER = 100.0  # times DAMPING, again and again, until no size moves by more than FARTHEST
 # Weight of a decade by which a derivative is off its quantity over the model's time scale: what equations tell wins by
 # its square, and it wins over DAMPING by as much.
 SLOW = 1e-3
@@ -135,13 +136,23 @@ class Factors:
         """The x of least norm with A·x near b, by normal equations: logarithms need a few digits, of which an iterative
         method takes as many steps as a chain has links."""
         matrix = with_small_indices(matrix)
-        digest = hashlib.sha256(repr(matrix.shape).encode())
+        digest, damping = hashlib.sha256(repr(matrix.shape).encode()), DAMPING
         for part in (matrix.indptr, matrix.indices, matrix.data):
             digest.update(part.data)
         if digest.digest() != self._digest:  # the matrix itself would take as much memory as its factors
-            normal = matrix.T @ matrix + DAMPING**2 * sp.eye_array(matrix.shape[1], format="csr")
-            self._digest, self._factors = digest.digest(), GraphElimination(normal)
-        return self._factors.solve(matrix.T @ right)
+            self._digest, self._factors = digest.digest(), _normal(matrix, damping)
+        found = self._factors.solve(matrix.T @ right)
+        # Powers are differences, known to a few digits. What they hardly tell, as the time of a mechanism that nothing
+        # drives, is told by their errors, and would move without bound.
+        while np.abs(found).max(initial=0.0) > FARTHEST and damping < 1.0:
+            damping *= STIFFER
+            found = _normal(matrix, damping).solve(matrix.T @ right)
+        return found
+
+
+def _normal(matrix: Any, damping: float) -> GraphElimination:
+    """The factors of damped normal equations."""
+    return GraphElimination(matrix.T @ matrix + damping**2 * sp.eye_array(matrix.shape[1], format="csr"))
 
 
 def _moved(size: np.ndarray, decades: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ def typical_sizes(
     fit or of a slider, have the same sizes, which are looked up then (0.1 ms in place of 3 for a pendulum).
     """
     started = _powers_of_two(_declared_or_started(model, parameters))
-    return _powers_of_two(_balanced(model.extended, parameters, started, _powers_of_two))
+    return _powers_of_two(_balanced(model.extended, _between(model, parameters), started, _powers_of_two))
 
 
 def unrounded_sizes(
@@ -37,7 +37,15 @@ def unrounded_sizes(
 ) -> Float[np.ndarray, " quantities"]:
     """As `typical_sizes` before rounding to powers of two. State selection compares sizes, and rounding could turn a
     small difference into a factor of two."""
-    return _balanced(model.extended, parameters, _declared_or_started(model, parameters), np.asarray)
+    started = _declared_or_started(model, parameters)
+    return _balanced(model.extended, _between(model, parameters), started, np.asarray)
+
+
+def _between(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
+    """What events assign starts at one of its values, where a branch of an equation may be zero that has a size in all
+    others: free friction says nothing of the force that friction has. Beside it, other branches count."""
+    assigned = model.flat.parameters.changed_by_events
+    return np.where(assigned[: len(parameters)], parameters * (1 + MOVED), parameters)
 
 
 def _powers_of_two(values: np.ndarray) -> np.ndarray:

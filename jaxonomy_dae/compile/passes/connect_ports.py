@@ -1,4 +1,5 @@
-"""Connections as equations: across variables of joined ports are equal, their through variables sum to zero."""
+"""Connections as equations: across variables of joined ports are equal, their through variables sum to zero, and what
+enters by a stream is the mixture of what leaves the others."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,6 +18,8 @@ from ..model.names import Names
 from ..model.provenance import Provenance, Provenances
 from ..model.tables import EquationGroup, PortTable
 from .number_model import Instances, ModelNumbers
+from .spanning_tree import closings, tree_edges
+from .stream_junctions import SMALL, mixed
 
 NAMED = 4  # ports of a junction, in messages
 
@@ -29,7 +32,8 @@ class _Ports:
     domains: list[Domain]  # that occur
     domain: np.ndarray
     owner: np.ndarray  # the component
-    variable: np.ndarray  # (ports, variables of a domain): across variables, then through variables
+    variable: np.ndarray  # (ports, variables of a domain), in the order of `Domain.variables`
+    nominal: np.ndarray  # of the flow that carries streams; 0 if it is not declared
     position: dict[int, int]  # of a component's port, by the port's id
 
 
@@ -52,7 +56,10 @@ class Junctions:
         domain = self.domains[self.domain[members[0]]]
         if k < len(domain.across):
             return Provenance(f"{kind} {where}: equal {domain.across[k][0]}")
-        return Provenance(f"{kind} {where}: {domain.through[k - len(domain.across)][0]} sums to zero")
+        k -= len(domain.across)
+        if k < len(domain.through):
+            return Provenance(f"{kind} {where}: {domain.through[k][0]} sums to zero")
+        return Provenance(f"{kind} {where}: what enters by {domain.streams[k - len(domain.through)][0]}")
 
 
 def connect_ports(model: ModelNumbers, diagram: AcausalDiagram, builder: list[EquationGroup]) -> PortTable:
@@ -78,7 +85,8 @@ def connect_ports(model: ModelNumbers, diagram: AcausalDiagram, builder: list[Eq
     by = np.argsort(junction, kind="stable")
     face, junction = face[by], junction[by]
     start = np.searchsorted(junction, np.arange(len(first) + 1))
-    _add_equations(ports, face, junction, start, builder)
+    tree = _in_tree(model, ports, face, junction, start)
+    _add_equations(ports, face, junction, start, tree, builder)
     has_inside = present[1::2]
     single = face[start[:-1][np.diff(start) == 1]]
     is_loose = np.zeros(model.n_ports, bool)
@@ -101,16 +109,47 @@ def _list_ports(model: ModelNumbers) -> _Ports:
         for _, d in shape:
             numbers.setdefault(d, len(numbers))
     domain, owner = np.empty(model.n_ports, np.int64), np.empty(model.n_ports, np.int64)
-    width = max((len(d.across) + len(d.through) for d in numbers), default=1)
+    width = max((len(d.variables) for d in numbers), default=1)
     variable = np.full((model.n_ports, width), -1, np.int64)
+    nominal = np.zeros(model.n_ports)
     for (shape, _), parts in shapes.items():
         first, number = np.concatenate([i.port for i in parts]), np.concatenate([i.number for i in parts])
         variables = np.concatenate([i.variable for i in parts])
         for j, (name, d) in enumerate(shape):
             domain[first + j], owner[first + j] = numbers[d], number
-            places = [parts[0].variable_positions[f"{name}.{n}"] for n, _ in (*d.across, *d.through)]
+            places = [parts[0].variable_positions[f"{name}.{n}"] for n, _ in d.variables]
             variable[(first + j)[:, None], np.arange(len(places))] = variables[:, None] + np.array(places)
-    return _Ports(model.port_names, list(numbers), domain, owner, variable, position)
+            if d.streams:
+                for i in parts:
+                    nominal[i.port + j] = i.component.variables[f"{name}.{d.through[0][0]}"].nominal
+    return _Ports(model.port_names, list(numbers), domain, owner, variable, nominal, position)
+
+
+def _in_tree(
+    model: ModelNumbers, ports: _Ports, face: np.ndarray, junction: np.ndarray, start: np.ndarray
+) -> np.ndarray:
+    """For each face, whether the across variables of its port equal those of the first of its junction. Of
+    overdetermined quantities, this holds along the edges of a tree."""
+    out = np.ones(len(face), bool)
+    domains = [k for k, d in enumerate(ports.domains) if d.overdetermined]
+    if not domains:
+        return out
+    mine = np.isin(ports.domain, domains)
+    pairs = [(i, pair) for i in model.instances for pair in i.component.tree_branches]
+    branches = [[i.port + ports.position[id(end)] for end in pair] for i, pair in pairs]
+    roots = [i.port + ports.position[id(end)] for i in model.instances for end in i.component.tree_roots]
+    first = face[start[:-1]][junction] // 2
+    later = np.flatnonzero((np.arange(len(face)) > start[:-1][junction]) & mine[face // 2])
+    none = np.zeros((0, 2), np.int64)
+    out[later] = tree_edges(
+        model.n_ports,
+        np.concatenate([none[:, 0], *roots]),
+        np.concatenate([none, *(np.stack(pair, axis=1) for pair in branches)]),
+        np.stack([first[later], face[later] // 2], axis=1),
+        ports.names,
+        np.flatnonzero(mine),
+    )
+    return out
 
 
 def _joined_faces(model: ModelNumbers, diagram: AcausalDiagram, ports: _Ports) -> tuple[np.ndarray, np.ndarray]:
@@ -171,22 +210,26 @@ def _faces(model: ModelNumbers, ports: _Ports, end: Port | PortArray, owner: Ins
 
 
 def _add_equations(
-    ports: _Ports, face: np.ndarray, junction: np.ndarray, start: np.ndarray, builder: list[EquationGroup]
-):
-    """The equations of all junctions, in the junctions' order."""
+    ports: _Ports, face: np.ndarray, junction: np.ndarray, start: np.ndarray, tree: np.ndarray,
+    builder: list[EquationGroup],
+):  # fmt: skip
+    """The equations of all junctions, in the junctions' order; those that are not linear follow."""
     size = np.diff(start)
     port, sign = face // 2, 1.0 - 2.0 * (face % 2)
     width = ports.variable.shape[1]
     source = Junctions(ports.names, ports.domains, ports.domain, port, start, width)
     # By length: (junction, place among its equations, item, variables, coefficients)
     found: dict[int, list[tuple[np.ndarray, ...]]] = {}
+    curved: list[EquationGroup] = []
     for d, domain in enumerate(ports.domains):
         n_across = len(domain.across)
         mine = np.flatnonzero(ports.domain[port[start[:-1]]] == d)
         inside = np.isin(junction, mine)
-        later = np.flatnonzero(inside & (np.arange(len(face)) > start[:-1][junction]))
-        set_ = junction[later]
+        all_later = np.flatnonzero(inside & (np.arange(len(face)) > start[:-1][junction]))
         for k in range(n_across):
+            of_tree = domain.overdetermined is not None and domain.across[k][0] in domain.overdetermined.names
+            later = all_later[tree[all_later]] if of_tree else all_later
+            set_ = junction[later]
             variable = ports.variable[np.stack([port[start[:-1][set_]], port[later]], axis=1), k]
             place = k * size[set_] + (later - start[:-1][set_])
             rows = (set_, place, set_ * width + k, variable, np.broadcast_to([1.0, -1.0], variable.shape))
@@ -198,6 +241,24 @@ def _add_equations(
                 place = np.full(len(sets), n_across * length + k)
                 rows = (sets, place, sets * width + k, ports.variable[port[members], k], sign[members])
                 found.setdefault(length, []).append(rows)
+            for k in range(len(domain.streams)):
+                column = n_across + len(domain.through) + k
+                leaves = ports.variable[port[members], column]
+                enters = ports.variable[port[members], column + len(domain.streams)]
+                within = face[members] % 2 == 1  # seen from inside, what enters the component leaves its port
+                leaves, enters = np.where(within, enters, leaves), np.where(within, leaves, enters)
+                if length <= 2:
+                    variable = np.stack([enters, leaves[:, ::-1]], axis=2).reshape(-1, 2)
+                    place = np.tile(column * length + np.arange(length), len(sets))
+                    item = np.repeat(sets * width + column, length)
+                    signs = np.broadcast_to([1.0, -1.0], variable.shape)
+                    found.setdefault(2, []).append((np.repeat(sets, length), place, item, variable, signs))
+                else:
+                    provenance = Provenances.made(source, sets * width + column, False)
+                    flows = ports.variable[port[members], n_across]
+                    curved += _mixtures(ports.nominal[port[members]], flows, sign[members], leaves, enters, provenance)
+        if domain.overdetermined is not None:
+            curved += _closed_loops(ports, domain, face, junction, start, all_later[~tree[all_later]], source, width)
     ordered = []
     for length, parts in found.items():
         set_, place, item, variable, coefficient = (np.concatenate(c) for c in zip(*parts, strict=True))
@@ -208,3 +269,32 @@ def _add_equations(
         provenance = Provenances.made(source, item, False)
         order = np.zeros(variable.shape)
         builder.append(EquationGroup.of(LinearTemplate(length), variable, order, provenance, coefficient=coefficient))
+    builder += curved
+
+
+def _mixtures(
+    nominal: np.ndarray, flow: np.ndarray, sign: np.ndarray, leaves: np.ndarray, enters: np.ndarray, source: Provenances
+) -> list[EquationGroup]:
+    """What enters each of the ports that meet; all arrays (junctions, ports). One group for each place among them."""
+    small = SMALL * np.where(nominal > 0, nominal, 1.0).min(axis=1)
+    out = []
+    for k in range(flow.shape[1]):
+        others = np.delete(np.arange(flow.shape[1]), k)
+        out.append(mixed(enters[:, k], flow[:, others], leaves[:, others], sign[:, others], small, source))
+    return out
+
+
+def _closed_loops(
+    ports: _Ports, domain: Domain, face: np.ndarray, junction: np.ndarray, start: np.ndarray, later: np.ndarray,
+    source: Junctions, width: int,
+) -> list[EquationGroup]:  # fmt: skip
+    """What connections demand that close loops of overdetermined quantities."""
+    assert domain.overdetermined is not None
+    if not len(later):
+        return []
+    columns = [[n for n, _ in domain.across].index(n) for n in domain.overdetermined.names]
+    ends = np.stack([face[start[:-1]][junction[later]], face[later]], axis=1) // 2
+    variable = ports.variable[ends[:, :, None], np.array(columns)].reshape(len(later), -1)
+    provenance = Provenances.made(source, junction[later] * width + columns[0], False)
+    order = np.zeros(variable.shape)
+    return [EquationGroup.of(t, variable, order, provenance) for t in closings(domain.overdetermined)]

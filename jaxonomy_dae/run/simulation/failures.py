@@ -312,9 +312,10 @@ def _sliding(relation: Event, t: float) -> str:
     """Explains a relation that turns again and again at the instant t, and what to write instead."""
     return (
         f"the integration stopped at t={t:.6g}: chattering. On both sides of '{relation.condition}' of component "
-        f"'{relation.owner}' the equations drive the solution back to where it turns. Say what holds there with a mode "
-        "(self.either, see library.friction); or let the conditions for turning forth and back lie apart (hysteresis), "
-        "with self.when; or use a smooth law, for instance tanh(x/small) instead of sign(x)"
+        f"'{relation.owner}' the equations drive the solution back to where it turns. Say what holds on both sides, "
+        "with self.sliding(surface, above, below): the solution then stays there; or let the conditions for turning "
+        "forth and back lie apart (hysteresis), with self.when; or use a smooth law, for instance tanh(x/small) "
+        "instead of sign(x)"
     )
 
 

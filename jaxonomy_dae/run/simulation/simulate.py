@@ -26,7 +26,7 @@ from ...solve.methods.failures import Stopped
 from ...solve.methods.solve import check_tolerances, default_tolerances
 from ...solve.methods.solve_arguments import jump_times
 from ...solve.methods.switching import BOUNDARY, MANY, SHARE, Watch
-from ..start.check import check
+from ..start.check import check, warn_of_outranked
 from ..start.initialize import InitialPoint, known_start, search_outside
 from ..start.ladder import Found
 from ..system.input_values import check_given
@@ -331,6 +331,8 @@ class _Call:
     def in_program(self, staged: bool) -> Solution:
         """The solution where values cannot be read."""
         checked, has_events = self.throw is True, self.system.plan.events is not None
+        if self.throw is not False and isinstance(self.given.initial, Mapping):
+            warn_of_outranked(self.system, self.given.initial, (), stacklevel=5)
         if staged:
             PROGRAMS.make_room()
             outcome = run(self.given, self.options(), self.watch(True), checked, self.begun)
@@ -359,7 +361,7 @@ class _Call:
         if self.throw is not False:
             check_parameters(system)
             if isinstance(given.initial, Mapping):
-                check(system, outcome.found, given.t0, given.inputs, given.initial)
+                check(system, outcome.found, given.t0, given.inputs, given.initial, stacklevel=4)
             else:
                 check_state(outcome.found)
         if self.switches and self._is_stiff(outcome):

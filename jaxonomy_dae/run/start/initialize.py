@@ -231,6 +231,17 @@ def search_outside(
     return jax.tree.map(as_argument, root)
 
 
+def slopes_at_guess(
+    system: Any, t0: Any, inputs: Any, initial: Mapping[str, Any], solve_for: tuple[str, ...] = ()
+) -> np.ndarray:
+    """The Jacobian of the rows where a search outside of programs begins."""
+    n = system.plan.n_state + len(solve_for)
+    nowhere = np.full(n, np.nan, system.parameters.values.dtype)
+    return jax.device_get(
+        _compiled_look(system.without_stiffness, t0, inputs, initial, solve_for, nowhere)
+    ).rows.jacobian
+
+
 def known_start(system: Any, t0: Any, inputs: Any, initial: Mapping[str, Any] | None) -> InitialPoint | None:
     """For a program that somebody else compiles: the consistent point, if all that it follows from has a value while
     that is traced, as where the weights of networks are trained that no constraint reads. None otherwise.

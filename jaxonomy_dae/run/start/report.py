@@ -8,19 +8,21 @@ import jax
 import numpy as np
 import scipy.sparse as sp
 
-from ...base.tolerances import DIGIT, HALF_OF_THE_DIGITS, ILL_CONDITIONED, TINY, ridge, solved
+from ...base.tolerances import DIGIT, HALF_OF_THE_DIGITS, ILL_CONDITIONED, KNOWN, TINY, ridge, solved
 from ...compile.diagnosis.lost_cancellation import lost_cancellation
 from ...compile.diagnosis.redundant_constraints import DependentConstraints, ModelAt, dependent_constraints, no_freedom
-from ...compile.diagnosis.wording import listed
+from ...compile.diagnosis.wording import listed, quoted
 from ...compile.lowering.plan import SystemPlan
+from ...compile.lowering.remembered import remembered
 from ...compile.model.tables import ZERO
 from ...graph.judgement.sparse_rank import sparse_rank_of
 from ..system.input_values import input_values
 from ..system.sections import SHOWN, Sections, some
 from .constraints_at import constraints_at
-from .initialize import InitialPoint, is_consistent
+from .initialize import InitialPoint, is_consistent, slopes_at_guess
+from .integrated import integrated
 from .ladder import FAILED, METHODS, NEAREST
-from .rows import StartRow, initial_rows, supports
+from .rows import InitialRows, StartRow, initial_rows, supports
 from .singular_blocks import BlockFinding, examine_blocks
 from .sparse_newton import sparse_rows
 
@@ -81,6 +83,7 @@ class InitializationReport(Sections):
         self, system: Any, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = ()
     ):
         self._system, self._found, self._inputs = system, found, inputs
+        self._t0, self._initial, self._solve_for = t0, initial, solve_for
         self._plan: SystemPlan = system.plan
         table = system.parameters.table
         self._key = (self._plan, tuple(sorted(initial or ())), tuple(table.index(n) for n in solve_for))
@@ -88,7 +91,7 @@ class InitializationReport(Sections):
         self.time = float(t0)
         self.method = METHODS[int(found.method)]
         self.evaluations = int(found.evaluations)
-        self.outranked = list(self._rows.dropped)
+        self.outranked = [row.name for row in self._rows.dropped]
         self.solved = [(n, float(v)) for n, v in zip(solve_for, np.asarray(found.solved), strict=True)]
         self._residual = np.asarray(found.residual, float)
         self._target = np.asarray(found.target, float)[len(self._residual) - len(self._rows.kept) :]
@@ -172,6 +175,65 @@ class InitializationReport(Sections):
                 return ()
             found += names
         return tuple(dict.fromkeys(found))
+
+    # --- starts that do not hold -------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def warnings(self) -> list[str]:
+        """Texts about starts that a component declares and that do not hold: fixed ones that gave way to values given,
+        and guesses of what the model integrates that told no more than no guess would have, as they lie as far from the
+        value found as zero does."""
+        return [*self._warning_of_outranked(), *self._warning_of_guesses()]
+
+    def _warning_of_outranked(self) -> list[str]:
+        rows = self._rows.dropped
+        if not rows:
+            return []
+        parameters = np.asarray(self._system.numbers, float)
+        values = np.asarray(self._system.observe(self.outranked, self.time, self._found.x, self._inputs), float)
+        declared = [row.start.value(parameters) for row in rows if row.start is not None]
+        starts = [Guess(*one) for one in zip(self.outranked, declared, values.tolist(), strict=True)]
+        left = [
+            f"'{g.name}' = {g.value:.6g}, declared {g.guess:.6g}"
+            for g, row in zip(starts, rows, strict=True)
+            if not (self._is_kept(g) or abs(g.moved) <= self._rounding(row.quantity))
+        ]
+        return [outranked(self._rows, left)] if left else []
+
+    def _warning_of_guesses(self) -> list[str]:
+        place, quantity, variable, factor = _guessed(*self._key)
+        if not len(place):
+            return []
+        guess = self._plan.flat.variables.start.values(np.asarray(self._system.numbers, float))[variable] / factor
+        value, rounding = self._x[place], KNOWN * np.asarray(self._system.typical_sizes)[quantity]
+        left = (np.abs(guess) > rounding) & (np.abs(value - guess) >= (1 - self._relative) * np.abs(guess))
+        if not left.any() or self._is_the_only_solution:
+            return []
+        names = self._plan.quantity_name
+        said = [f"'{names[int(quantity[k])]}' = {value[k]:.6g}, guessed {guess[k]:.6g}" for k in np.flatnonzero(left)]
+        return [
+            f"the start is far from what is guessed: {', '.join(said)}. If this is another solution than the one that "
+            "is meant, give better guesses, or fix one of them"
+        ]
+
+    @property
+    def _is_the_only_solution(self) -> bool:
+        """True if the slopes of the equations are the same at the guesses and at the solution, as those of linear
+        equations are: then guesses choose nothing. Of large models this is not looked at, and nothing is said."""
+        there = self._found.jacobian
+        if there is None or np.ndim(there) != 2:
+            return True
+        there = np.asarray(there, float)
+        begun = slopes_at_guess(self._system, self._t0, self._inputs, self._initial, self._solve_for)[: len(there)]
+        size = np.abs(there).max(axis=1, keepdims=True, initial=0.0)
+        return bool((np.abs(begun - there) <= HALF_OF_THE_DIGITS * size).all())
+
+    def _rounding(self, quantity: int) -> float:
+        """The size at which a number of this quantity is rounding beside others of the model."""
+        return KNOWN * float(self._system.typical_sizes[quantity]) if quantity != ZERO else 0.0
+
+    def _is_kept(self, g: Guess) -> bool:
+        return abs(g.moved) <= self._relative * max(abs(g.value), abs(g.guess))
 
     # --- residuals ---------------------------------------------------------------------------------------------
 
@@ -375,6 +437,10 @@ class InitializationReport(Sections):
         lines.append(f"{mend}, or remove from the model what has become superfluous.")
         return "\n".join(lines)
 
+    def _guess(self, g: Guess) -> str:
+        kept = "kept" if self._is_kept(g) else f"moved by {g.moved:.3g} from {g.guess:.6g}"
+        return f"{g.name} = {g.value:.6g}, {kept}"
+
     def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
         singular = [b for b in self.blocks if b.singular]
         state = "a consistent" if self.consistent else "no consistent"
@@ -395,7 +461,7 @@ class InitializationReport(Sections):
             ("redundant, as they follow from others", [_redundancy(r) for r in self.redundant if r.agrees]),
             ("contradicting", [_contradiction(r) for r in self.redundant if not r.agrees]),
             ("fixed in the model, but outranked by values given", self.outranked),
-            ("guesses", [_guess(g, self._relative) for g in self.guesses]),
+            ("guesses", [self._guess(g) for g in self.guesses]),
             ("does not hold, worst first", [f"{r.text}: off by {abs(r.value):.3g}" for r in self.residuals]),
             ("singular", [self._singular(b).replace("\n", " ") for b in singular]),
             ("notes", self.notes),
@@ -403,10 +469,30 @@ class InitializationReport(Sections):
         return head, [(title, list(entries)) for title, entries in sections if entries]
 
 
-def _guess(g: Guess, relative: float) -> str:
-    if abs(g.moved) <= relative * max(abs(g.value), abs(g.guess)):
-        return f"{g.name} = {g.value:.6g}, kept"
-    return f"{g.name} = {g.value:.6g}, moved by {g.moved:.3g} from {g.guess:.6g}"
+@remembered
+def _guessed(plan: SystemPlan, names: tuple[str, ...], unknown: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    """Of what the model integrates and nothing fixes, declared guesses: places in the state array, quantities,
+    variables, and the variables' factors."""
+    rows = initial_rows(plan, names, unknown)
+    held = {row.quantity for row in rows.kept[: len(rows.kept) - rows.n_soft]}
+    inside, order, index = integrated(plan), plan.extended.quantities.order, plan.variable_index
+    found = [
+        (k, row.quantity, index[row.name], row.factor)
+        for k, row in enumerate(rows.guess)
+        if row is not None and row.start is not None and row.name in index and row.quantity not in held
+        and not order[row.quantity] and inside[row.quantity]
+    ]  # fmt: skip
+    place, quantity, variable, factor = zip(*found, strict=True) if found else ((),) * 4
+    return np.array(place, int), np.array(quantity, int), np.array(variable, int), np.array(factor, float)
+
+
+def outranked(rows: InitialRows, starts: Sequence[str]) -> str:
+    """The text of a warning: values given take the place of fixed starts."""
+    given = [row.name for row in rows.kept if row.given >= 0]
+    return (
+        f"initial={{...}}: {quoted(given)} determine{'s' * (len(given) == 1)} variables whose starts are fixed in the "
+        f"model, and what is given counts: {', '.join(starts)}. Give these variables instead, or values that agree"
+    )
 
 
 def _redundancy(r: Redundant) -> str:

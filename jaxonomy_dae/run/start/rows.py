@@ -61,7 +61,7 @@ class InitialRows:
     direct: bool  # every kept row is a state and nothing else constrains the states
     redundant: tuple[int, ...]  # rows that must hold, though they follow from others
     settled: tuple[int, ...]  # of these, rows that follow from equations alone: no unknown moves them
-    dropped: tuple[str, ...]  # fixed starts that values given by the caller outrank
+    dropped: tuple[StartRow, ...]  # fixed starts that values given by the caller outrank
     unshared: tuple[
         str, ...
     ] = ()  # guesses that gave way to others, where there are too many unknowns for a compromise
@@ -163,7 +163,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
         direct=False,
         redundant=tuple(place for place, k in enumerate(kept) if not closes[k]),
         settled=tuple(place for place, k in enumerate(kept) if follows[k]),
-        dropped=tuple(row.name for row, gone in zip(rows, is_dropped, strict=True) if gone),
+        dropped=tuple(row for row, gone in zip(rows, is_dropped, strict=True) if gone),
         unshared=unshared,
         hints=hints,
     )

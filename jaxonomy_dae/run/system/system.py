@@ -515,7 +515,7 @@ class AcausalSystem(eqx.Module):
         check_range(inputs, t0, t0)
         initial = self.plan.one_by_one(initial)
         found = find_initial(self, t0, inputs, initial, names, solver)
-        found = check(self, found, t0, inputs, initial, names, throw=throw)
+        found = check(self, found, t0, inputs, initial, names, throw=throw, stacklevel=3)
         if solve_for is None:
             return found.x
         table = self.parameters.table

@@ -41,7 +41,7 @@ class Aftermath(NamedTuple):
     - `armed`: the side of zero on which each guard is, shape (guards,).
     - `left`: the events still to happen, shape (clocks + guards,).
     - `caused`, `stuck`: guards that an event of this instant made true, and guards that one left at zero, about to fall
-        again, shape (guards,).
+        again, shape (guards,); `later`: guards that turn when repeated events are over, shape (guards,).
     """
 
     q: Array
@@ -51,6 +51,7 @@ class Aftermath(NamedTuple):
     left: Array
     caused: Array
     stuck: Array
+    later: Array
 
 
 class _Outlook(NamedTuple):
@@ -67,10 +68,10 @@ class _Outlook(NamedTuple):
 
 
 def aftermath(
-    problem: AbstractHybridProblem, t: Time, x: Array, q: Array, instant: Instant, arrival: Arrival, now: Happening,
-    args: Args,
+    problem: AbstractHybridProblem, t: Time, time: Time, x: Array, q: Array, instant: Instant, arrival: Arrival,
+    now: Happening, args: Args,
 ) -> Aftermath:  # fmt: skip
-    """The situation after the events that happen `now`, which have left x and q.
+    """The situation after the events that happen `now`, at the `time` of their own, which have left x and q.
 
     Where the equations are singular with q, for example where a switch closes onto a diode that conducts, modes that
     are chosen by their conditions change along with it (`modes`).
@@ -79,9 +80,10 @@ def aftermath(
     left = instant.left & ~now.these
     if not g:
         slope = problem.slope(t, x, q, args)
-        return Aftermath(q, slope, jnp.ones_like(x), instant.state.armed, left, instant.caused, instant.stuck)
+        unchanged = instant.caused, instant.stuck, instant.later
+        return Aftermath(q, slope, jnp.ones_like(x), instant.state.armed, left, *unchanged)
     written_q = q
-    problem, t, x, q, delay, args = still(constant_once((problem, t, x, q, now.delay, args)))
+    problem, t, time, x, q, delay, args = still(constant_once((problem, t, time, x, q, now.delay, args)))
     instant, now = still(instant), now._replace(delay=delay)
     rested = now.these[c:] & (instant.state.armed == RESTS)
     turns_back = jnp.asarray(problem.facts.opposite)[jnp.clip(now.event - c, 0, g - 1)] == jnp.arange(g)
@@ -92,21 +94,21 @@ def aftermath(
         so before."""
         return is_zero(value, rate, arrival) & ((jnp.abs(rate) * ahead <= band) | rested)
 
-    outlook = _outlook(problem, (t, x, q, delay, args), instant, arrival, ahead, is_flat)
+    outlook = _outlook(problem, (t, time, x, q, delay, args), instant, arrival, ahead, is_flat)
     written_q = jnp.where(outlook.flips, 1.0 - written_q, written_q) if problem.facts.choices else written_q
     slow = (jnp.abs(outlook.earlier - outlook.slope) <= STEADY * jnp.abs(outlook.slope)).astype(x.dtype)
-    side, next_ones, caused, stuck = _sides(problem, instant, arrival, now, left, turns_back, outlook, is_flat)
-    return Aftermath(written_q, outlook.slope, slow, side, jnp.concatenate([left[:c], next_ones]), caused, stuck)
+    side, next_ones, *others = _sides(problem, instant, arrival, now, left, turns_back, outlook, is_flat)
+    return Aftermath(written_q, outlook.slope, slow, side, jnp.concatenate([left[:c], next_ones]), *others)
 
 
 def _outlook(
-    problem: AbstractHybridProblem, point: tuple[Time, Array, Array, Time, Args], instant: Instant, arrival: Arrival,
-    ahead: Time, is_flat: Callable[[Array, Array], Array],
+    problem: AbstractHybridProblem, point: tuple[Time, Time, Array, Array, Time, Args], instant: Instant,
+    arrival: Arrival, ahead: Time, is_flat: Callable[[Array, Array], Array],
 ) -> _Outlook:  # fmt: skip
     """Evaluates slopes, guards and their rates at the four places, the last one only where a guard is flat; `point` is
-    (t, x, q, delay of the event, args). It does so in a loop, for XLA compiles the equations as often as they are
-    written."""
-    t, x, q, delay, args = point
+    (t, time of the event, x, q, its delay, args). It does so in a loop, for XLA compiles the equations as often as they
+    are written."""
+    t, own_time, x, q, delay, args = point
     g = problem.facts.n_guards
     sets, conditions = (
         jnp.asarray(sets_to_flip(problem.facts.choices, len(q))),
@@ -117,7 +119,7 @@ def _outlook(
         k, search, slopes, values, rates = carry
         slope, now = slopes[0], jnp.where(search.flipped(sets), 1.0 - q, q) if problem.facts.choices else q
         places = jnp.stack([x, instant.arrived, x - slope * delay, x + slope * ahead])
-        time = t + jnp.stack([delay, jnp.zeros_like(t), jnp.zeros_like(t), ahead])[k]
+        time = jnp.stack([own_time, t, t, t + ahead])[k]
         own = problem.slope(time, places[k], now, args)
         slopes = written(slopes, k, own)
         value, rate = problem.rates(time, places[k], now, args, jnp.where((k == 0) | (k == 3), own, slope))
@@ -142,12 +144,13 @@ def _outlook(
 def _sides(
     problem: AbstractHybridProblem, instant: Instant, arrival: Arrival, now: Happening, left: Array, turns_back: Array,
     outlook: _Outlook, is_flat: Callable[[Array, Array], Array],
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
     """Returns (the sides of the guards after an event, the guards whose events happen next, those that an event of this
-    instant made true, those that are stuck)."""
+    instant made true, those that are stuck, those that turn when repeated events are over)."""
     c = problem.facts.n_clocks
     relations = problem.facts.are(EventFlag.RELATION)
-    here, armed, event = now.these[c:], instant.state.armed, now.event
+    repeated = problem.facts.are(EventFlag.REPEATED)[c:]
+    here, armed, event = now.these[c:] & ~repeated, instant.state.armed, now.event
     band, ahead = rounding(arrival.size), outlook.ahead
     (value, at_arrival, _, _), (rate, rate_there, _, rate_ahead) = outlook.values, outlook.rates
     reached = at_arrival <= jnp.maximum(band, within(rate_there, arrival))
@@ -169,14 +172,19 @@ def _sides(
     landed = zero & (armed == ABOVE) & ~here & ~reached & (jnp.abs(value) <= band)
     landed = landed & (now.moved | (left[c:] & instant.caused)) & problem.facts.true_at_zero & ~relations[c:]
     stays = (left[c:] & now.onto & (value == 0)) | equal | landed
-    true = jnp.where(zero, ((falling * arrival.span < -band) & ~now.waits) | stays, value < 0)
-    was_armed = ((armed > 0) & ~here) | (turns_back & (event >= c)) | (now.rose & ~here)
+    falls = (falling * arrival.span < -band) & ~now.waits
+    if repeated.any():  # what crosses at this instant does so whatever the others change
+        stays = stays | (left[c:] & ~instant.later & jnp.asarray(relations[c:]) & reached)
+    true = jnp.where(zero, falls | stays, value < 0)
+    was_armed = ((armed > 0) & ~here) | (turns_back & (event >= c)) | (now.rose & ~here) | repeated
     # What this event made true happens next. A pending event still happens, even if a state was set anew: unless the
     # new values make its condition false, or it is revocable and undone.
     stands = left[c:] & ~problem.facts.are(EventFlag.REVOCABLE)[c:] & reached
     caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & (~zero | equal | landed)
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     rests = was_armed | left[c:] | (falling * arrival.span > band)  # an event that was undone may happen later
+    # While discrete equations are repeated, time stands still: what they make move turns thereafter.
+    later = zero & falls & ~stays & (~left[c:] | instant.later) if repeated.any() else instant.later
     side = jnp.where(zero, jnp.where(rests, RESTS, BELOW), ABOVE)
     side = jnp.where(true, jnp.where(next_ones, ABOVE, BELOW), side)
     # If the event leaves its own guard at zero, the guard's rate says whether it falls on or has turned. A rate below
@@ -191,4 +199,4 @@ def _sides(
     sinks = pull * (SINKING * arrival.span) >= rise + jnp.sqrt(rise**2 + 4 * pull * band)
     held = flat & (pull > 0) & (rise**2 <= 4 * pull * band) & sinks  # it would rise to twice the band
     stuck = ((here & now.moved & (side == RESTS)) | instant.stuck) & held
-    return side.astype(armed.dtype), next_ones, caused, stuck
+    return side.astype(armed.dtype), next_ones, caused, stuck, later

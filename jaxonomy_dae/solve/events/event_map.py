@@ -38,11 +38,15 @@ SLIDES, TURNS = 64, 4
 
 def most_at_once(problem: AbstractHybridProblem) -> int:
     """The largest number of events that can be listed at one instant."""
-    return _most_in_turn(problem) * max(int(problem.facts.are(EventFlag.STRIKE).sum()), 1)
+    at_once = (int(problem.facts.are(kind).sum()) for kind in (EventFlag.STRIKE, EventFlag.LAST))
+    return _most_in_turn(problem) * max(*at_once, 1)
 
 
 def _most_in_turn(problem: AbstractHybridProblem) -> int:
-    return problem.facts.n_clocks + min(2 * problem.facts.n_guards, CONDITIONS_AT_ONE_INSTANT)
+    facts = problem.facts
+    if facts.are(EventFlag.REPEATED).any():
+        return facts.n_clocks + 2 * CONDITIONS_AT_ONE_INSTANT
+    return facts.n_clocks + min(2 * facts.n_guards, CONDITIONS_AT_ONE_INSTANT)
 
 
 def handle(
@@ -59,9 +63,10 @@ def handle(
         arrival, first = _with_jumps(problem, t, state, arrival, args)
     events = _Events.of(problem, t, state, arrival, args, at_start)
     start = Instant(
-        state=state, left=arrival.due, caused=arrival.jumped, delay=jnp.zeros_like(t), round=first,
-        before=state.x, approach=arrival.slope, previous=state.q, slope=arrival.slope, arrived=state.x,
-        stuck=jnp.zeros((problem.facts.n_guards,), bool), noted=noted, wrote=events.rivals.nobody,
+        state=state, left=arrival.due, caused=arrival.jumped, delay=jnp.zeros_like(t), time=t, round=first,
+        before=state.x, approach=arrival.slope, previous=state.q, there=state.x, slope=arrival.slope, arrived=state.x,
+        stuck=jnp.zeros((problem.facts.n_guards,), bool), later=jnp.zeros((problem.facts.n_guards,), bool),
+        noted=noted, wrote=events.rivals.nobody,
     )  # fmt: skip
     length = _most_in_turn(problem)
     # Loops of fixed length, whose bodies are skipped where nothing is left: reverse mode cannot go back over a `while`.
@@ -107,6 +112,7 @@ class _Events(NamedTuple):
     ends: Array
     relations: Array
     strikes: Array
+    last: np.ndarray
     waits: Array | np.ndarray
 
     @staticmethod
@@ -122,13 +128,13 @@ class _Events(NamedTuple):
             problem=problem, t=t, arrival=arrival, args=args, at_start=at_start, first=state.count,
             rivals=Rivals.of(facts), listed=facts.are(EventFlag.LISTED) & (np.arange(c + g) >= c) & (not at_start),
             ends=jnp.asarray(facts.ends).astype(t.dtype), relations=jnp.asarray(facts.are(EventFlag.RELATION)),
-            strikes=jnp.asarray(facts.are(EventFlag.STRIKE)), waits=waits,
+            strikes=jnp.asarray(facts.are(EventFlag.STRIKE)), last=facts.are(EventFlag.LAST), waits=waits,
         )  # fmt: skip
 
     @property
     def several(self) -> bool:
-        """True if events may strike together."""
-        return bool(self.problem.facts.are(EventFlag.STRIKE).sum() > 1)
+        """True if events may happen together."""
+        return any(self.problem.facts.are(kind).sum() > 1 for kind in (EventFlag.STRIKE, EventFlag.LAST))
 
     def after_next(self, instant: Instant) -> Instant:
         """The instant after the next event, or the next ones that strike together."""
@@ -137,19 +143,27 @@ class _Events(NamedTuple):
         state, q = instant.state, instant.state.q
         # Where nothing is left, as in some members of a batch, nothing happens: derivatives of what would have happened
         # need not be finite.
-        goes_on = jnp.any(instant.round & instant.left)
-        together = instant.left & (instant.round | ~goes_on)
+        candidates, begun = instant.left, instant.round & instant.left
+        if self.last.any():
+            candidates = self._first_ones(instant)
+            begun = begun & candidates & ~self.last  # they read what all others have left
+        goes_on = jnp.any(begun)
+        together = candidates & (instant.round | ~goes_on)
         base, base_slope, previous = (
             jnp.where(goes_on, kept, now)
             for kept, now in ((instant.before, state.x), (instant.approach, instant.slope), (instant.previous, q))
         )
         now = self._happening(instant, jnp.where(jnp.any(together), jnp.argmax(together), c + g))
         event, delay = now.event, now.delay
-        # A step may end a rounding error off the tick: what equations read at a tick, they read at its own time.
-        time, reached = jnp.where(now.is_clock, now.tick, t + delay), state.x + instant.slope * delay
+        # What another event caused happens at the time of that one, where the state is what it left. The slope between
+        # them may be as large as you please, as that of parts that are held to see what force it takes.
+        caused = ~now.is_clock & instant.caused[jnp.clip(event - c, 0, max(g - 1, 0))] if g else jnp.array(False)
+        time, reached = t + delay, jnp.where(caused, instant.there, state.x + instant.slope * delay)
+        if c:  # a step may end a rounding error off the tick, at whose time equations read
+            time = jnp.where(now.is_clock, now.tick, jnp.where(caused, instant.time, time))
         x, written = problem.written(time, reached, base + base_slope * delay, q, previous, now.these, args)
         now = now._replace(moved=jnp.any(x != reached) & ~self.relations[event])
-        after = aftermath(problem, t, x, written, instant, arrival, now, args)
+        after = aftermath(problem, t, time, x, written, instant, arrival, now, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         turns = state.turns + (~now.is_clock).astype(t.dtype)
         again = self._again(now, after.stuck, turns)
@@ -178,16 +192,26 @@ class _Events(NamedTuple):
             left=after.left,
             caused=after.caused,
             delay=delay,
+            time=time,
             round=together,
             before=base,
             approach=base_slope,
             previous=previous,
+            there=x,
             slope=after.slope,
             arrived=instant.arrived,
             stuck=after.stuck,
+            later=after.later,
             noted=self._noted(instant, now, logged, time, sides),
             wrote=wrote,
         )
+
+    def _first_ones(self, instant: Instant) -> Array:
+        """The events that are left and wait for no other one."""
+        later = jnp.concatenate([jnp.zeros((self.problem.facts.n_clocks,), bool), instant.later])
+        first = instant.left & ~later & ~self.last
+        last = instant.left & self.last
+        return jnp.where(jnp.any(first), first, jnp.where(jnp.any(last), last, instant.left))
 
     def _happening(self, instant: Instant, event: Array) -> Happening:
         """The event, when it happens, and what happens with it; whether it writes states is not known yet."""
@@ -208,7 +232,8 @@ class _Events(NamedTuple):
         # kink.
         these = one_hot(event, c + g)
         if self.several:
-            these = these | (instant.left & self.strikes & self.strikes[event])
+            for kind in (self.strikes, jnp.asarray(self.last)):
+                these = these | (instant.left & kind & kind[event])
         return Happening(
             event=event, is_clock=is_clock, tick=tick, these=these, delay=delay, rates=rates, moved=np.False_,
             approach=jnp.where(instant.caused | self.at_start, 0.0, rates), rose=rose, onto=onto, waits=self.waits,

@@ -24,12 +24,13 @@ class Instant(eqx.Module):
     - `state`: the state after the events so far.
     - `left`: the events still to happen, shape (clocks + guards,).
     - `caused`: the guards that another event of this instant made fall, shape (guards,).
-    - `delay`: δ of the last event (second).
+    - `delay`: δ of the last event (second); `time`: when it happened.
     - `round`: the events that happen as one: all read what was before the first of them; what they cause comes after.
     - `before`, `approach`, `previous`: the continuous state before this round, its slope, and the discrete values.
-    - `slope`: dx/dt after the last event.
+    - `there`: the continuous state after the last event, at its own time; `slope`: dx/dt then.
     - `arrived`: the continuous state before the instant.
     - `stuck`: the guards that an event has left at zero, about to fall again, shape (guards,).
+    - `later`: the guards at zero that turn when repeated events are over, shape (guards,).
     - `noted`: the events of this instant that are listed.
     - `wrote`: which event of this round wrote each contested place last.
     """
@@ -38,13 +39,16 @@ class Instant(eqx.Module):
     left: Array
     caused: Array
     delay: Time
+    time: Time
     round: Array
     before: Array
     approach: Array
     previous: Array
+    there: Array
     slope: Array
     arrived: Array
     stuck: Array
+    later: Array
     noted: EventRows
     wrote: Array
 

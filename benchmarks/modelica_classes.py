@@ -1,0 +1,226 @@
+"""The classes of a Modelica library that have connectors: opened, counted, compiled in a plant of boundaries.
+
+    python -m benchmarks.modelica_classes --library FOLDER [--packages Modelica.Electrical …] [--every N]
+        [--out FILE] [--page FILE]
+
+`--library` holds the folder Modelica (a checkout of modelica/ModelicaStandardLibrary, tag v4.1.0; not part of this
+project). Each class is opened by the front end; its equations and unknowns are counted: of an open class, the flows of
+its connectors are determined outside. Then it becomes a component, each port of which meets a boundary whose flow is
+its potential, each input a constant, and the plant is compiled. Parameters without a value are 1. Classes that are
+partial, and those without connectors, are counted apart. `GIVEN` holds what some classes do not have by themselves.
+
+Classes run in a process that is replaced when one of them takes too long. Lines of JSON go to `--out`, from where a
+second call goes on; the table by sub-library and the reasons go to `--page`.
+"""
+
+import argparse
+import collections
+import json
+import multiprocessing
+import resource
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv
+from jaxonomy_dae.library.signal import Constant
+from jaxonomy_dae.modelica import Library
+from jaxonomy_dae.modelica.library import component_of
+from jaxonomy_dae.modelica.open_class import OpenClass
+from jaxonomy_dae.modelica.packing import components_in
+from jaxonomy_dae.modelica.port_domains import domain_of
+from jaxonomy_dae.modelica.sources import Sources
+
+STAGES = ("found", "opened", "balanced", "translated", "compiled")
+SECONDS = 30  # of processor time, for each class after the first
+MEMORY = 6 << 30  # bytes of memory
+WATER = "redeclare package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater"
+GIVEN = {  # modifications of classes whose names begin so: the first that fits
+    "Modelica.Fluid.Vessels.": f"{WATER}, nPorts = 1, use_portsData = false",
+    "Modelica.Fluid.Sources.": f"{WATER}, nPorts = 1",
+    "Modelica.Fluid.": WATER,
+    "Modelica.Mechanics.MultiBody.World": "enableAnimation = false",
+}
+
+
+class Boundaries(Component):
+    """A port for each port of a class; the flow into each is its potential, and each stream leaves it with the value 1.
+
+    A tree of frames that begins in none of the class's ports begins here, in a frame that stands still. Upon the other
+    frames act a force and a torque that grow with their place and their rotation.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, of: OpenClass):
+        super().__init__(ev, name)
+        first = True
+        for k, port in enumerate(of.ports):
+            domain = domain_of(port)
+            mine = self.port(f"p{k}", domain)
+            across, through = ([self[f"p{k}.{n}"] for n, _ in side] for side in (domain.across, domain.through))
+            streams = [self[f"p{k}.{n}"] for n, _ in domain.streams]
+            self.add_equations(*(Eq(h, 1) for h in streams))
+            reached = {b for _, b in of.branches} | set(of.roots)
+            if not port.orientation:
+                self.add_equations(*(Eq(f, p) for f, p in zip(through, across, strict=True)))
+            elif port.name in reached:
+                self.add_equations(
+                    *(Eq(f, p) for f, p in zip(through[:3], across[:3], strict=True)),
+                    *(Eq(t, self[f"p{k}.R.T[{i}]"]) for t, i in zip(through[3:], ("2,3", "3,1", "1,2"), strict=True)),
+                )
+            else:
+                still = [0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]
+                self.declare_root(mine)
+                across[:3] = [*across[:3]] if first else [*through[:3]]
+                first = False
+                self.add_equations(*(Eq(p, x) for p, x in zip(across, still, strict=True)))
+
+
+def main() -> int:
+    asked = _arguments()
+    names = [n for p in asked.packages for n in components_in(Sources([asked.library]), p)][:: asked.every]
+    done = {r["class"]: r for r in _read(asked.out)}
+    left = [n for n in names if n not in done]
+    start = time.monotonic()
+    while left and time.monotonic() - start < asked.minutes * 60:
+        until = asked.minutes * 60 - (time.monotonic() - start)
+        for row in _by_a_process(left, asked, until):
+            done[row["class"]] = row
+            with open(asked.out, "a", encoding="utf-8") as out:
+                out.write(json.dumps(row) + "\n")
+        left = [n for n in left if n not in done]
+    page = _page([done[n] for n in names if n in done], len(names))
+    print(page)
+    if asked.page:
+        Path(asked.page).write_text(page, encoding="utf-8")
+    return 0
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.modelica_classes")
+    parser.add_argument("--library", required=True)
+    parser.add_argument("--packages", nargs="+", default=["Modelica"], help="packages or classes")
+    parser.add_argument("--every", type=int, default=1, help="take each N-th class")
+    parser.add_argument("--minutes", type=float, default=1e6, help="begin no class after this time")
+    parser.add_argument("--out", default="modelica_classes.jsonl")
+    parser.add_argument("--page", help="a file for the tables, in Markdown")
+    return parser.parse_args()
+
+
+def _read(file: str) -> list[dict]:
+    try:
+        with open(file, encoding="utf-8") as lines:
+            return [json.loads(line) for line in lines]
+    except FileNotFoundError:
+        return []
+
+
+def _by_a_process(names: Sequence[str], asked: argparse.Namespace, seconds: float):
+    """The rows of classes, until one of them ends the process or the time is over."""
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe(duplex=False)
+    child = context.Process(target=_rows, args=(there, names, asked.library), daemon=True)
+    child.start()
+    there.close()
+    start, left = time.monotonic(), list(names)
+    try:
+        while left:
+            yield here.recv()
+            left.pop(0)
+            if time.monotonic() - start > seconds:
+                break
+    except EOFError:
+        child.join()
+        yield {"class": left[0], "reached": "nothing", "error": "late", "why": f"it ended with {child.exitcode}"}
+    child.kill()
+    child.join()
+
+
+def _rows(there: Any, names: Sequence[str], root: str) -> None:
+    sys.setrecursionlimit(20_000)
+    warnings.simplefilter("ignore")
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    library = Library(root)
+    first = True
+    for name in names:
+        used = int(time.process_time())
+        hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+        resource.setrlimit(resource.RLIMIT_CPU, (used + SECONDS * (3 if first else 1), hard))
+        there.send(row_of(library, name))
+        first = False
+    there.close()
+
+
+def row_of(library: Library, name: str) -> dict:
+    """What becomes of a class: how far it comes, its counts, and the error that ends it."""
+    row: dict = {"class": name, "reached": "nothing"}
+    start = time.process_time()
+    try:
+        for stage in _stages(library, name, row):
+            row["reached"] = stage
+    except Exception as error:
+        row |= {"error": type(error).__name__, "why": " ".join(str(error).split())[:400]}
+    row["seconds"] = round(time.process_time() - start, 2)
+    return row
+
+
+def _stages(library: Library, name: str, row: dict):
+    yield "found"
+    found = library.opened(name, next((text for prefix, text in GIVEN.items() if name.startswith(prefix)), ""))
+    row["connectors"] = len(found.ports) + len(found.inputs) + len(found.outputs)
+    yield "opened"
+    values: dict[str, Any] = dict.fromkeys(found.required, 1.0)
+    component_of(found)(EqnEnv(), "x", **values)
+    yield "translated"
+    row |= _compiled(found)
+    yield "compiled"
+
+
+def _compiled(of: OpenClass) -> dict:
+    """The sizes of the compiled plant of one component and its boundaries."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    values: dict[str, Any] = dict.fromkeys(of.required, 1.0)
+    x = component_of(of)(ev, "x", **values)
+    diagram.add(x)
+    if of.ports:
+        rim = Boundaries(ev, "rim", of)
+        diagram.add(rim)
+        for k, port in enumerate(of.ports):
+            diagram.connect(x, port.name, rim, f"p{k}")
+    for k, name in enumerate(of.inputs):
+        value = Constant(ev, f"u{k}", 0.5)
+        diagram.add(value)
+        diagram.connect(value, "y", x, name)
+    system = AcausalCompiler(ev, diagram)()
+    return {"states": len(system.states)}
+
+
+def _page(rows: list[dict], all_of_them: int) -> str:
+    partial = [r for r in rows if "is partial" in r.get("why", "")]
+    bare = [r for r in rows if r.get("connectors") == 0]
+    rows = [r for r in rows if r not in partial and r not in bare]
+    of: dict[str, list[dict]] = collections.defaultdict(list)
+    for row in rows:
+        of[".".join(row["class"].split(".")[1:3])].append(row)
+    lines = [
+        f"{len(partial)} partial, {len(bare)} without connectors; of {all_of_them}",
+        "",
+        "| package | classes | opened | translated | compiled |",
+        "|---|---|---|---|---|",
+    ]
+    for name, group in [*sorted(of.items()), ("**all**", rows)]:
+        counts = [
+            sum(r["reached"] in STAGES and STAGES.index(r["reached"]) >= STAGES.index(s) for r in group)
+            for s in ("opened", "translated", "compiled")
+        ]
+        lines.append(f"| {name} | {len(group)} | " + " | ".join(map(str, counts)) + " |")
+    reasons = collections.Counter((r["reached"], r["error"]) for r in rows if "error" in r)
+    lines += ["", "| classes | reached | error |", "|---|---|---|"]
+    lines += [f"| {n} | {s} | {e} |" for (s, e), n in reasons.most_common()]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

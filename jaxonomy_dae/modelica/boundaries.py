@@ -1,0 +1,246 @@
+"""Boundaries that a class meets while it is flattened, where its surroundings decide what its connectors mean.
+
+A front end that flattens a class alone takes it for a complete model: what enters by a stream is then what leaves, and
+a body believes that it is the root of all frames. So the class becomes a component of a model. Each of its connectors
+with streams is connected to a boundary, whose stream variables are what `inStream` reads. A boundary that is a root is
+joined to each tree of frames; in place of the equations that a connection to it would bring, as many others stand.
+Afterwards, everything that reads variables of boundaries goes out, and so does an `inner` component that the front end
+has added by itself, as `world`, if no equation of the class reads its variables.
+"""
+
+import dataclasses
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from ..write.ports import inflow
+from . import tree
+from .flat_model import FlatModel
+from .front_end import Flattened, FrontEnd, Unbalanced, Unrooted
+from .rumoca_expressions import SCALAR, Json
+
+MODEL = "Opened"  # of the text in which a class is opened
+_INSIDE, _RIM = "opened__", "rim__"  # the class, and its boundaries, in that model
+_FRAME = "Modelica.Mechanics.MultiBody.Interfaces.Frame_a"
+_ORIENTATION = ".R"  # ends the name of a record of frames that is overdetermined
+_LACKING = 9
+# A frame has 12 overdetermined quantities and 3 torques: its boundary lacks 9 equations.
+_IN_PLACE = "{0}.w = {1}.r_0; {0}.T[1, :] = {1}.r_0; {0}.T[2, :] = {1}.r_0;"
+
+
+class Closed(NamedTuple):
+    """A class that was flattened as a component of a model: `outer` are the variables of components that the front end
+    has added, `graph` are edges of the trees of overdetermined records and `roots` those of its records that begin a
+    tree."""
+
+    found: Flattened
+    outer: frozenset[str] = frozenset()
+    graph: tuple[tuple[str, str], ...] = ()
+    roots: tuple[str, ...] = ()
+
+
+def flattened(
+    front_end: FrontEnd,
+    name: str,
+    changes: str = "",
+    source: str | None = None,
+    frames: Callable[[], Sequence[str]] = list,
+) -> Closed:
+    """Flattens a class, alone or, if its connectors ask for it, with boundaries. `frames` names its connectors
+    that are frames: nothing else tells of those that no equation turns.
+
+    **Raises:**
+
+    - `ModelError` as `FrontEnd.flatten`.
+    """
+    before = f"{source or ''}\n"
+    modified = f"{_INSIDE}({changes})" if changes else _INSIDE
+    alone, trees = _alone(front_end, name, changes, source, frames)
+    streams = list(_with_streams(alone.flat))
+    if not trees and not streams:
+        return Closed(alone, graph=_edges(alone.flat), roots=tuple(alone.flat["definite_roots"]))
+    variables = alone.flat["variables"]
+    declared, equations, renamed = [f"{name} {modified};"], [], {}
+    if "world.enableAnimation" in variables:
+        declared.append("inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false);")
+    for k, top in enumerate(streams):
+        declared += _rim(k, top, variables)
+        equations.append(f"connect({_INSIDE}.{top}, {_RIM}{k}.port);")
+        for n, v in variables.items():
+            if n.startswith(f"{top}.") and v["stream"]:
+                stream = n[len(top) + 1 :]
+                renamed[f"{_RIM}{k}.port.{stream}"] = f"{top}.{inflow(stream)}"
+    for k, (n, kind) in enumerate(_inputs(alone.dae)):
+        declared.append(f"input {kind} {_RIM}u{k}{_size(n, variables)};")
+        equations.append(f"{_INSIDE}.{n} = {_RIM}u{k};")
+    roots = _roots(trees, f"{_INSIDE}.")
+    text = f"{before}{_model([*declared, *roots[0]], [*roots[1], *equations])}"
+    return _as_alone(front_end.flatten(text, MODEL), alone, renamed)
+
+
+def _alone(
+    front_end: FrontEnd, name: str, changes: str, source: str | None, frames: Callable[[], Sequence[str]]
+) -> tuple[Flattened, list[str]]:
+    """The class by itself, and the overdetermined records that need a root outside."""
+    extended = f"extends {name}({changes});" if changes else f"extends {name};"
+    trees: list[str] = []
+    while True:
+        try:
+            if changes or trees:
+                declared, equations = _roots(trees, "")
+                found = front_end.flatten(f"{source or ''}\n{_model([extended, *declared], equations)}", MODEL)
+            else:
+                found = front_end.flatten(source, name)
+        except Unrooted as error:
+            if not error.record.endswith(_ORIENTATION) or error.record in trees:
+                raise
+            trees.append(error.record)
+            continue
+        except Unbalanced as error:
+            loose = [f"{n}{_ORIENTATION}" for n in frames() if f"{n}{_ORIENTATION}" not in trees]
+            if not loose or error.missing != _LACKING * len(loose):
+                raise
+            trees += loose
+            continue
+        wanting = [r for r in _believed(found.flat) if r.endswith(_ORIENTATION) and r not in trees]
+        if not wanting:
+            return found, trees
+        trees += wanting
+
+
+def _model(declared: Sequence[str], equations: Sequence[str]) -> str:
+    body = f" equation {' '.join(equations)}" if equations else ""
+    return f"model {MODEL} {' '.join(declared)}{body} end {MODEL};\n"
+
+
+def _believed(flat: Json) -> Iterator[str]:
+    """The overdetermined records of connectors that take themselves for roots as nothing else is one."""
+    edges = [*flat["branches"], *flat["optional_edges"]]
+    reached = set(flat["definite_roots"])
+    while more := {n for edge in edges for n in edge if set(edge) & reached} - reached:
+        reached |= more
+    for record, *_ in flat["potential_roots"]:
+        if record not in reached and record.partition(".")[0] in flat["top_level_connectors"]:
+            yield record
+
+
+def _roots(trees: Sequence[str], inside: str) -> tuple[list[str], list[str]]:
+    """Boundaries that are roots of trees, and equations that begin with them."""
+    declared, equations = [], []
+    for k, record in enumerate(trees):
+        rim, of = f"{_RIM}r{k}", f"{inside}{record}"
+        declared.append(f"{_FRAME} {rim};")
+        equations.append(f"Connections.root({rim}.R); Connections.branch({rim}.R, {of}); {rim}.r_0 = zeros(3);")
+        equations.append(f"{rim}.R = Modelica.Mechanics.MultiBody.Frames.nullRotation(); {_IN_PLACE.format(of, rim)}")
+    return declared, equations
+
+
+def _with_streams(flat: Json) -> Iterator[str]:
+    """The innermost connectors of the class that have streams."""
+    tops = {n.partition("[")[0] for n in flat["top_level_connectors"]}
+    found = [n.rpartition(".")[0] for n, v in flat["variables"].items() if v["stream"]]
+    yield from (n for n in dict.fromkeys(found) if re.split(r"[.\[]", n)[0] in tops)
+
+
+def _rim(k: int, top: str, variables: Mapping[str, Json]) -> Iterator[str]:
+    """A boundary for a connector: a connector with the same variables, and values of all but its flows."""
+    declared, values = [], []
+    for n, v in variables.items():
+        if not n.startswith(f"{top}.") or v["causality"] != "Empty":
+            continue
+        name, size = n[len(top) + 1 :], _size(n, variables)
+        prefix = "flow " if v["flow"] else "stream " if v["stream"] else ""
+        declared.append(f"{prefix}Real {name}{size};")
+        if not v["flow"]:
+            values.append(f"port.{name} = fill(z, {size[1:-1]});" if size else f"port.{name} = z;")
+    yield f"connector {_RIM}K{k} {' '.join(declared)} end {_RIM}K{k};"
+    yield f"model {_RIM}B{k} {_RIM}K{k} port; Real z = 0; equation {' '.join(values)} end {_RIM}B{k};"
+    yield f"{_RIM}B{k} {_RIM}{k};"
+
+
+def _size(name: str, variables: Mapping[str, Json]) -> str:
+    dims = variables[name]["dims"] if name in variables else []
+    return f"[{', '.join(map(str, dims))}]" if dims else ""
+
+
+def _inputs(dae: Json) -> Iterator[tuple[str, str]]:
+    """The inputs of a class, and their types."""
+    types = dae["storage"]["value_types"]
+    for v in dae["storage"]["variables"]:
+        if v["role"] == "input" and v["attributes"].get("binding") is None:
+            yield v["name"], SCALAR[types[v["value_type"]]["scalar"]]
+
+
+def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) -> Closed:
+    """A flattened model with boundaries, under the names that the class has alone."""
+    names = [v["name"] for v in found.dae["storage"]["variables"]]
+    outer = frozenset(n for n in names if not n.startswith((_INSIDE, _RIM)))
+
+    def under_own_names(of: Json, also: Mapping[str, str]) -> Json:
+        text = json.dumps(of).replace(f'"{_INSIDE}.', '"')
+        for before, after in also.items():
+            text = text.replace(f'"{before}"', f'"{after}"')
+        return json.loads(text)
+
+    dae, told = under_own_names(found.dae, renamed), under_own_names(found.flat, {})
+    flat: dict[str, Any] = {
+        **told,
+        "top_level_connectors": [n for n in alone.flat["top_level_connectors"] if not n.startswith(_RIM)],
+        "model_description": alone.flat.get("model_description"),
+    }
+    for n, v in flat["variables"].items():
+        if n in alone.flat["variables"]:
+            v["causality"] = alone.flat["variables"][n]["causality"]
+    inputs = {n for n, _ in _inputs(alone.dae)}
+    before = {v["name"]: v for v in alone.dae["storage"]["variables"]}
+    for v in dae["storage"]["variables"]:
+        n = v["name"]
+        if n in inputs:
+            v["role"] = "input"
+        if n in inputs or n in before and before[n]["role"] != "input":
+            v["attributes"]["causality"] = before[n]["attributes"]["causality"]
+    return Closed(Flattened(found.name, dae, flat), outer, _edges(flat), tuple(flat["definite_roots"]))
+
+
+def _edges(flat: Json) -> tuple[tuple[str, str], ...]:
+    """The edges of trees that a class has inside."""
+    return tuple((a, b) for a, b in (*flat["branches"], *flat["optional_edges"]) if not a.startswith(_RIM))
+
+
+def without_boundaries(model: FlatModel, outer: frozenset[str]) -> FlatModel:
+    """The model without what reads variables of boundaries, and without the variables of outer components that no
+    equation of the class reads."""
+    own = model.model
+    equations = [(e, set(_names(e))) for e in own.equations]
+    kept = [(e, names) for e, names in equations if not any(n.startswith(_RIM) for n in names)]
+    parameters = {d.name for d in own.declarations if d.prefixes & {"parameter", "constant"}}
+    around = {n for d in own.declarations for n in [re.sub(r"\[[\d,]+\]$", "", d.name)] if n in outer} - parameters
+    around -= {re.sub(r"\[[\d,]+\]$", "", n) for n in parameters}
+    mine = [(e, names) for e, names in kept if not names or names - around - parameters]
+    others = [(e, names) for e, names in kept if names and not names - around - parameters]
+    read = {n for _, names in mine for n in names & around}
+    while more := [(e, names) for e, names in others if names & read and (e, names) not in mine]:
+        mine += more
+        read |= {n for _, names in more for n in names & around}
+    chosen = {id(e) for e, _ in mine}
+    gone = around - read
+    declarations = tuple(
+        d for d in own.declarations if not d.name.startswith(_RIM) and re.sub(r"\[[\d,]+\]$", "", d.name) not in gone
+    )
+    initial = tuple(e for e in own.initial_equations if not any(n.startswith(_RIM) or n in gone for n in _names(e)))
+    left = own._replace(
+        declarations=declarations,
+        equations=tuple(e for e in own.equations if id(e) in chosen),
+        initial_equations=initial,
+    )
+    return dataclasses.replace(model, model=left)
+
+
+def _names(e: Any) -> Iterator[str]:
+    """The names of all references inside."""
+    if isinstance(e, tree.Reference):
+        yield e.path
+    if isinstance(e, tuple):
+        for part in e:
+            yield from _names(part)

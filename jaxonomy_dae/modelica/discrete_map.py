@@ -1,0 +1,253 @@
+"""The discrete equations of a flat model as one map, which events repeat at an instant until nothing changes.
+
+Given are m = F(m, pre(m), y), an equation for each discrete variable m that is kept, in the present values of all
+others and in continuous variables y, which follow m by the other equations. At an instant
+
+- m becomes F(m, pre(m), y), while pre(m) is held, until m = F(m, pre(m), y);
+- then, if m differs from pre(m), pre(m) becomes m, and all begins again.
+
+This is the event iteration of the Modelica Language Specification 3.6, Appendix B. Both are events here, so that
+relations which depend on m turn in between, and derivatives pass through them as through all events. Equations are
+sorted: what one of them reads is the new value of another one.
+
+A `when` is a part of the equations of what it assigns: m is the value in its body where its condition is true and was
+not in the iteration before, and pre(m) otherwise (sections 8.3.5 and 11.2.7).
+"""
+
+import functools
+import graphlib
+from typing import Any, NamedTuple
+
+import sympy
+
+from ..base.aliases import Condition, Expression
+from ..base.errors import ModelError
+from ..graph.expressions.to_sympy import shortened
+from ..write.events import Assign, EventFlag, Reinit, Terminate, pre
+from ..write.symbols import DiscreteSymbol, VariableSymbol
+from .scope import AT_FIRST, REAL, STARTED, STARTING, Scope, previous
+from .values import Value, as_number, both, chosen, either, negated, plain
+
+# What two evaluations of one number at one instant may differ by, in parts of it: states are followed over a delay
+# that is rounding between them.
+SAME = sympy.Float(1e-10)
+
+
+class Branch(NamedTuple):
+    """A branch of a `when`: `acts` is true in the iteration in which its body holds; `text` is its condition, "" if it
+    is that of clocks alone."""
+
+    acts: Condition
+    text: str
+
+
+class DiscreteMap:
+    """The discrete equations of a component, gathered one by one and written at the end.
+
+    - `values`: the new value of each variable that is kept, in present values.
+    - `always`: those whose value may change without a `when`.
+    """
+
+    def __init__(self, scope: Scope):
+        self.scope = scope
+        self.values: dict[str, Value] = {}
+        self.always: set[str] = set()
+        self._hidden: dict[VariableSymbol, Expression] = {}
+        self._conditions: list[tuple[VariableSymbol, DiscreteSymbol]] = []
+        self._branches: list[Branch] = []
+        self._reinits: dict[VariableSymbol, list[tuple[Condition, Value]]] = {}
+        self._ends: list[tuple[Condition, str]] = []
+
+    # --- what is gathered --------------------------------------------------------------------------------------------
+
+    def give(self, name: str, value: Value, always: bool = False) -> None:
+        """Says what a variable becomes."""
+        if name in self.values:
+            raise ModelError(
+                f"'{name}' is assigned by two whens, which may happen at one instant: join them by elsewhen, or by if"
+            )
+        self.values[name] = value
+        if always:
+            self.always.add(name)
+
+    def branches(self, conditions: list[list[tuple[Value, bool]]]) -> list[Condition]:
+        """When each branch of a `when` acts: one of its conditions becomes true, and those of no branch before do. A
+        condition is a pair (truth, whether it counts at the initial time, too)."""
+        out: list[Condition] = []
+        before: Value = False
+        for entries in conditions:
+            rises = functools.reduce(either, (self._rises(*entry) for entry in entries), False)
+            acts = self._truth("acts", both(rises, negated(before)))
+            before = either(before, acts)
+            if not isinstance(acts, bool):
+                shown = [_shown(self.scope, t) for t, _ in entries if t is not False and not self._is_tick(t)]
+                self._branches.append(Branch(acts, " or ".join(shown)))
+            out.append(acts)
+        return out
+
+    def reinit(self, acts: Condition, state: VariableSymbol, value: Value) -> None:
+        """Starts a state anew at the end of the iteration in which a branch acts."""
+        self._reinits.setdefault(state, []).append((acts, value))
+
+    def end(self, acts: Condition, message: str) -> None:
+        """Ends the run where a branch acts."""
+        self._ends.append((acts, message))
+
+    def _rises(self, truth: Value, at_start: bool) -> Value:
+        """True in the iteration in which a condition becomes true."""
+        if isinstance(truth, bool):
+            return False  # it never becomes true
+        kept = self.scope.kept.in_discrete(truth)
+        if isinstance(kept, bool):
+            return False
+        started = self.scope.phase(STARTED)
+        if self._is_tick(kept):  # true for one iteration: nothing is to be remembered
+            return both(kept, started)
+        now = self._truth("true", kept)
+        was = self.scope.hidden(f":was[{len(self._conditions)}]", 0)
+        self._conditions.append((next(iter(now.free_symbols)), was))
+        rises = both(now, plain(sympy.Eq(was, 0)))
+        return rises if at_start else both(rises, started)
+
+    def _is_tick(self, truth: Value) -> bool:
+        """True for a condition that holds at the ticks of clocks only."""
+        ticks = {tick: sympy.Integer(0) for tick in self.scope.ticks.values()}
+        return isinstance(truth, sympy.Basic) and plain(truth.xreplace(ticks)) is False
+
+    def _truth(self, kind: str, condition: Value) -> Value:
+        """A condition as a hidden variable that is 1 or 0, so that what is long stands once."""
+        if isinstance(condition, bool):
+            return condition
+        symbol = VariableSymbol(f":when:{kind}[{len(self._hidden)}]")
+        self._hidden[symbol] = as_number(condition)
+        return sympy.Eq(symbol, 1)
+
+    def share_relations(self) -> None:
+        """Lets bodies see the relations that conditions and equations read as these do, when all of them are known."""
+        self.values = {n: self.scope.kept.in_bodies(value) for n, value in self.values.items()}
+        for cases in self._reinits.values():
+            cases[:] = [(acts, self.scope.kept.in_bodies(value)) for acts, value in cases]
+
+    # --- what is written ---------------------------------------------------------------------------------------------
+
+    def write(self) -> None:
+        """Adds the events to the component."""
+        scope = self.scope
+        if not (self.values or self._branches or scope.initial is not None or scope.ticks):
+            return
+        new = {DiscreteSymbol(n): VariableSymbol(f":when:new[{n}]") for n in self.values}
+        definitions = {new[DiscreteSymbol(n)]: sympy.sympify(as_number(value)) for n, value in self.values.items()}
+        definitions |= self._hidden
+        first = scope.phase(AT_FIRST)
+        replaced: dict[sympy.Basic, sympy.Basic] = {
+            previous(s): sympy.Piecewise((as_number(v), first), (previous(s), True), evaluate=False)
+            for s, v in scope.initially.items()
+        }
+        replaced |= new
+        definitions = {s: e.xreplace(replaced) for s, e in definitions.items()}
+        _check_order(definitions, {v: k.path for k, v in new.items()})
+        for symbol, expression in definitions.items():
+            scope.component._hidden(symbol.path, expression)
+        self._write_events(new, replaced)
+
+    def _write_events(self, new: dict[DiscreteSymbol, VariableSymbol], replaced: dict) -> None:
+        """The events, in the order in which one waits for another: the start, the equations, the next iteration."""
+        c, scope = self.scope.component, self.scope
+        solves = EventFlag.AT_START | EventFlag.REVOCABLE | EventFlag.REPEATED
+        names = ", ".join(f"'{s.path}'" for s in new) or "whens"
+        starting, started = scope.phase(STARTING), negated(scope.phase(STARTING))
+        initial = scope.initial
+        assert initial is not None
+        before = [Assign(previous(m), m) for m in new]
+        c._event(starting, (*before, Assign(initial, sympy.Integer(AT_FIRST))), None, solves, f"start of {names}")
+        differs = [self._differs(m, n) for m, n in new.items()]
+        pending = self._number("pending", both(started, functools.reduce(either, differs, False)))
+        unsettled = pending is not None
+        if pending is not None:
+            assigned = tuple(Assign(m, n) for m, n in new.items())
+            c._event(_is(pending), assigned, None, solves, f"equations of {names}")
+        settled = both(started, plain(sympy.Eq(pending, 0))) if unsettled else started
+        acts = functools.reduce(either, (b.acts for b in self._branches if b.text), False)
+        moves: list[Value] = [plain(sympy.Ne(new[m], previous(m))) for m in new if m.path in self.always]
+        moves += [plain(sympy.Ne(now, was)) for now, was in self._conditions]
+        moves += [plain(sympy.Eq(tick, 1)) for tick in scope.ticks.values()]
+        goes_on = functools.reduce(either, moves, scope.phase(AT_FIRST))
+        actions = [
+            *(Assign(m, n) for m, n in new.items()),
+            *(Assign(previous(m), n) for m, n in new.items()),
+            *(Assign(was, now) for now, was in self._conditions),
+            *(Assign(tick, _unless(pre(initial), pre(tick))) for tick in scope.ticks.values()),
+            Assign(initial, sympy.Integer(STARTED)),
+        ]
+        ends = [(scope.hidden(f":ends[{k}]", 0), text, when) for k, (when, text) in enumerate(self._ends)]
+        actions += [Assign(done, as_number(when)) for done, _, when in ends]
+        starts = [
+            Reinit(x, VariableSymbol(c._hidden(f":when:reinit[{x.path}]", _first(cases, x).xreplace(replaced))))
+            for x, cases in self._reinits.items()
+        ]
+        shown = " or ".join(dict.fromkeys(b.text for b in self._branches if b.text)) or "a tick"
+        whens = self._number("happens", both(settled, acts))
+        if whens is not None:
+            c._event(_is(whens), (*actions, *starts), None, solves | EventFlag.LAST | EventFlag.LISTED, shown)
+        quiet = self._number("goes on", both(both(settled, negated(acts)), goes_on))
+        if quiet is not None:
+            c._event(_is(quiet), (*actions, *starts), None, solves | EventFlag.LAST, f"next iteration of {names}")
+        for done, text, _ in ends:
+            c._event(sympy.Eq(done, 1), (Terminate(text),), None, EventFlag.LISTED | EventFlag.AT_START, shown)
+
+    def _differs(self, m: DiscreteSymbol, new: VariableSymbol) -> Value:
+        """True while a variable has not the value of its equation."""
+        if self.scope.kind(self.scope.declared[m.path].type) != REAL:
+            return sympy.Ne(m, new)
+        return sympy.Gt(sympy.Abs(m - new), SAME * (sympy.Abs(m) + sympy.Abs(new)), evaluate=False)
+
+    def _number(self, kind: str, condition: Value) -> VariableSymbol | None:
+        """A hidden variable that is 1 where a condition holds and 0 elsewhere; None where it never does."""
+        if isinstance(condition, bool):
+            return None
+        return VariableSymbol(self.scope.component._hidden(f":when:{kind}", as_number(condition)))
+
+
+def _shown(scope: Scope, truth: Value) -> str:
+    """A condition as the text has it."""
+    if not isinstance(truth, sympy.Basic):
+        return str(truth)
+    names: dict[sympy.Basic, sympy.Basic] = {scope.phase(STARTED): sympy.true}
+    for clock, tick in scope.ticks.items():
+        period: Any = sympy.sympify(clock.period)
+        names[sympy.Eq(tick, 1)] = sympy.Symbol(f"sampled({f'{float(period):g}' if period.is_number else period})")
+    for s in truth.free_symbols:
+        if isinstance(s, DiscreteSymbol) and s != scope.initial and s not in scope.ticks.values():
+            names |= dict.fromkeys((sympy.Eq(s, 1), s), sympy.Symbol(str(s).removeprefix(":")))
+    return shortened(truth.xreplace(names))
+
+
+def _is(truth: VariableSymbol) -> Condition:
+    """A condition for an event that jumps: it is halfway between the two values of a truth."""
+    return sympy.Ge(truth, sympy.Rational(1, 2))
+
+
+def _unless(initial: Expression, tick: Expression) -> Expression:
+    """A tick is over, but for one that is not looked at before the initial time has settled."""
+    return sympy.Piecewise((0, sympy.Eq(initial, STARTED)), (tick, True), evaluate=False)
+
+
+def _first(cases: list[tuple[Condition, Value]], otherwise: Value) -> Expression:
+    value: Value = otherwise
+    for acts, result in reversed(cases):
+        value = chosen(acts, result, value)
+    return sympy.sympify(value)
+
+
+def _check_order(definitions: dict[VariableSymbol, Expression], names: dict[VariableSymbol, str]) -> None:
+    """Raises an error that names the variables whose new values depend on each other."""
+    reads = {s: sorted((r for r in e.free_symbols if r in definitions), key=str) for s, e in definitions.items()}
+    try:
+        tuple(graphlib.TopologicalSorter(reads).static_order())
+    except graphlib.CycleError as error:
+        circle = [names[s] for s in reversed(error.args[1]) if s in names]
+        circle = circle if circle[:1] == circle[-1:] else [*circle, *circle[:1]]
+        raise ModelError(
+            f"at one instant the values of {' → '.join(circle)} depend on each other: let one of them read the value "
+            f"before, pre({circle[0]})"
+        ) from None
