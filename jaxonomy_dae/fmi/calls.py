@@ -52,6 +52,9 @@ class Calls:
         self._lock = threading.Lock()
         self._sizes = np.concatenate([np.ones(1), fmu.sizes(fmu.states), fmu.sizes(fmu.inputs)])
         self._sizes_of_parameters = fmu.sizes(parameters)
+        free = [(-np.inf, np.inf)] * (1 + self._n)
+        self._bounds = np.array([*free, *map(fmu.bounds, fmu.inputs)]).T
+        self._bounds_of_parameters = np.array([fmu.bounds(n) for n in parameters]).reshape(-1, 2).T
         self.parameter_values = [fmu.start(n) for n in parameters]
         self._histories = Histories(fmu, lambda: Instance(fmu, parameters, outputs), INSTANCES + 2 * self._k)
         first = self._histories.at(tuple(map(float, self.parameter_values)), 0)
@@ -118,12 +121,13 @@ class Calls:
         given = np.array(at.p) if by_parameters else np.array([at.t, *at.x, *at.u])
         step = NEAR if at_event or (by_parameters and self.has_events) else STEP
         sizes = self._sizes_of_parameters if by_parameters else self._sizes
+        low, high = self._bounds_of_parameters if by_parameters else self._bounds
         for k in range(len(given)):
             h = step * max(abs(given[k]), sizes[k])
             ends = []
             for sign in (1.0, -1.0):
                 end = given.copy()
-                end[k] += sign * h
+                end[k] = np.clip(end[k] + sign * h, low[k], high[k])  # at a bound, one side only
                 there = at._replace(p=tuple(end.tolist())) if by_parameters else self._point_of(end, at)
                 ends.append((there, end[k]))
             yield k, ends[0][0], ends[1][0], ends[0][1] - ends[1][1]

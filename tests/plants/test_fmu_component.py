@@ -145,6 +145,14 @@ def test_an_event_of_an_fmu_and_its_derivatives(ball, saves):
     np.testing.assert_allclose(slopes[:2], [[0, 0], [G * FALL, 0]], atol=1e-6)
 
 
+def test_a_parameter_at_its_bound_moves_to_one_side(decay):
+    """x' = u − k·x with k between 0 and 10: ∂x'/∂k = −x, at a bound, too."""
+    calls = Calls(Described(decay, "f: "), [], ["d.k"])
+    for k in (0.0, 5.0, 10.0):
+        at = Point(0.0, np.array([3.0]), np.zeros(1), (k,), 0)
+        np.testing.assert_allclose(calls._jacobian(at, True), [[-3.0]], rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_gradients_through_events_of_an_fmu(ball):
     """Two members of a batch that bounce once, and the gradient of the height by e: g·T·(t − T)."""
