@@ -171,7 +171,7 @@ def beyond(instance: Instance, event: Event, earliest: float) -> tuple[float, np
         step = max(step, due - t) if due is not None and instance.is_due(t) else step
         return t + step, x + step * slope
     k, positive = event.sign
-    least = NUDGE * np.finfo(float).eps * max(abs(t), np.finfo(float).tiny)
+    least = NUDGE * np.finfo(float).eps * max(abs(t), np.finfo(float).eps)  # at t = 0, too, more than zero
     while step <= FARTHEST * max(abs(t), 1.0):
         there = t + step, x + step * slope
         if signs(instance, *there, event.u)[k] == positive:
