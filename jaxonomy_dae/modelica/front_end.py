@@ -76,6 +76,10 @@ class FrontEnd:
             if counts := _UNBALANCED.search(str(error)):
                 raise Unbalanced(said, int(counts[2]) - int(counts[1])) from None
             raise ModelError(said) from None
+        except BaseException as error:
+            if type(error).__name__ != "PanicException":  # of a Rust library: no Exception, and not importable
+                raise
+            raise ModelError(f"rumoca {self.rumoca.version()} fails at '{model}': {error}") from None
 
     def _opened(self) -> Any:
         if self.session is None:

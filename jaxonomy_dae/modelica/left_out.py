@@ -126,5 +126,6 @@ LEFT_OUT: dict[str, Callable[..., Value]] = {
     "Modelica.Math.Distributions.Normal.cumulative": _normal_cumulative,
     "Modelica.Math.Special.erfInv": of_numbers(scipy.special.erfinv, sympy.erfinv),
     "Modelica.Math.Matrices.leastSquares": _least_squares,
+    "Modelica.Utilities.Strings.substring": lambda text, first, last: text[first - 1 : last],
     "getInterpolationCoefficients": time_table_coefficients,
 }

@@ -17,6 +17,7 @@ from jaxonomy_dae.library import electrical, thermal
 from jaxonomy_dae.modelica import Library, component
 from jaxonomy_dae.modelica.__main__ import main
 from jaxonomy_dae.modelica.front_end import FrontEnd
+from jaxonomy_dae.modelica.left_out import LEFT_OUT
 from jaxonomy_dae.modelica.readable_sources import with_readable_parameters
 from jaxonomy_dae.modelica.shelf import pack
 from jaxonomy_dae.modelica.stored import read, written
@@ -297,3 +298,9 @@ def test_a_library_is_packed_from_the_command_line(tmp_path, library, capsys):
     assert packed.equations == library["Devices.Resistor"](EqnEnv(), "r", R=1.0).equations
     assert main(["pack", str(file), "Nothing", "--root", str(written_to(tmp_path))]) == 1
     assert "there is no 'Nothing' in" in capsys.readouterr().err
+
+
+def test_a_part_of_a_text_is_counted_from_one():
+    """Transformers of the library find their windings in texts such as "Dy05"."""
+    substring = LEFT_OUT["Modelica.Utilities.Strings.substring"]
+    assert [substring("Dy05", 1, 1), substring("Dy05", 2, 2), substring("Dy05", 3, 4)] == ["D", "y", "05"]
