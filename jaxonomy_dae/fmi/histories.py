@@ -21,7 +21,6 @@ from .instance import Instance
 
 SAVED = 256  # states that an instance keeps
 NUDGE = 32.0  # spacings of floating-point numbers at the time of an event: the first attempt to get beyond it
-SHORTEST = 1e-30  # s: the first attempt at the time zero
 FARTHEST = 1e-3  # in units of the time: the last attempt
 
 Parameters = tuple[float, ...]
@@ -172,7 +171,7 @@ def beyond(instance: Instance, event: Event, earliest: float) -> tuple[float, np
         step = max(step, due - t) if due is not None and instance.is_due(t) else step
         return t + step, x + step * slope
     k, positive = event.sign
-    least = max(NUDGE * np.finfo(float).eps * abs(t), SHORTEST)
+    least = NUDGE * np.finfo(float).eps * max(abs(t), np.finfo(float).eps)  # at t = 0, too, more than zero
     while step <= FARTHEST * max(abs(t), 1.0):
         there = t + step, x + step * slope
         if signs(instance, *there, event.u)[k] == positive:
