@@ -137,6 +137,8 @@ def test_an_event_of_an_fmu_and_its_derivatives(ball, saves):
     np.testing.assert_allclose(down[:2], [0.0, 0.8 * G * FALL], rtol=1e-12, atol=1e-12)
     before, after = (Point(0.5, np.array([0.3, 1.0]), none, p, int(n)) for n in (begun[2], down[2]))
     assert [calls._values(at)[-1] for at in (after, before, after)] == [1.0, 0.0, 1.0]
+    idle = calls._after((0, False), Point(0.0, np.array([1.0, 0.0]), none, p, int(begun[2])), 0.0)
+    np.testing.assert_array_equal(idle[:2], [1.0, 0.0])  # the map of events asks where nothing happens, at zero, too
     at = Point(FALL, np.array([0.0, -G * FALL]), none, p, int(begun[2]))
     # By (t, h, v, the next time event), and by (e, g).
     slopes = calls._jacobian_of_after((0, False), at, 0.0, False)
