@@ -231,6 +231,8 @@ def test_a_member_that_fails_is_not_a_number(ts):
 
 
 @pytest.mark.slow
+# At rtol 1e-4 the tolerance of a position leaves 0.26 % of the car axis' force open, as the warning says: 26·rtol.
+@pytest.mark.filterwarnings("ignore:'caraxis.lam1' hangs on the state")
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_published_problems_with_nothing_said(name):
     """All within 50·rtol, as test_testset.py asks of every solver, and errors fall with the tolerance."""
