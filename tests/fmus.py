@@ -105,6 +105,17 @@ def exported(system, folder, name="model", **options):
     return path
 
 
+def discrete_values(system, fmu):
+    """The discrete variables of an FMU: hidden ones of a Modelica model, which it does not show, are what they are
+    between two events."""
+    if all(name in fmu.reference for name in system.discretes):
+        return [float(fmu.get(name)[0]) for name in system.discretes]
+    started = dict(zip(system.discretes, simulate(system, 1e-9).at(-1).discrete.tolist(), strict=False))
+    shown = {name: float(fmu.get(name)[0]) for name in started if name in fmu.reference}
+    before = {name: shown[name.replace(":pre(", "").rstrip(")")] for name in started if ":pre(" in name}
+    return [*(started | shown | before).values()]
+
+
 def point(system, fmu, outputs):
     """Returns (names of unknowns, of knowns, values of knowns, the unknowns as a function of the knowns' values)."""
     states = system.states
@@ -120,7 +131,7 @@ def point(system, fmu, outputs):
     values = [jnp.asarray(v[0]) for v in values] + leaves
     n, m, k = len(states), len(inputs), len(parameters)
 
-    discrete = jnp.asarray([*(fmu.get(name)[0] for name in system.discretes)])
+    discrete = jnp.asarray(discrete_values(system, fmu))
     q = jnp.concatenate([discrete, system.discrete_values[len(discrete) :]])
     guess = system.initialize(inputs=dict(zip(inputs, fmu.get(*inputs), strict=True)))[n:]
 
