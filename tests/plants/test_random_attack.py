@@ -61,7 +61,7 @@ def judge_apart(*arguments: str) -> list[list[int]]:
 
 @pytest.mark.slow
 def test_some_of_each_family():
-    families = [name for name in FAMILIES if name not in OWN]
+    families = [name for name in FAMILIES if name not in OWN and name != "invariance"]  # that has a row for each letter
     counts = judge_apart("--family", ",".join(families), "--count", "3", "--seed", "400", "--moving", "3")
     assert len(counts) == len(families)
     assert all(right + refused == 3 and not any(others) for right, refused, *others in counts)
