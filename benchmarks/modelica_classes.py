@@ -1,13 +1,13 @@
-"""The classes of a Modelica library that have connectors: opened, counted, compiled in a plant of boundaries.
+"""The classes of a Modelica library that have connectors: opened, translated, compiled in a plant of boundaries.
 
     python -m benchmarks.modelica_classes --library FOLDER [--packages Modelica.Electrical …] [--every N]
         [--out FILE] [--page FILE]
 
 `--library` holds the folder Modelica (a checkout of modelica/ModelicaStandardLibrary, tag v4.1.0; not part of this
-project). Each class is opened by the front end; its equations and unknowns are counted: of an open class, the flows of
-its connectors are determined outside. Then it becomes a component, each port of which meets a boundary whose flow is
-its potential, each input a constant, and the plant is compiled. Parameters without a value are 1. Classes that are
-partial, and those without connectors, are counted apart. `GIVEN` holds what some classes do not have by themselves.
+project). Each class is opened by the front end and becomes a component, each port of which meets a boundary whose flow
+is its potential, each input a constant. The plant is compiled, which refuses one whose equations are not as many as its
+unknowns. Parameters without a value are 1. Classes that are partial, and those without connectors, are counted apart.
+`GIVEN` holds what some classes do not have by themselves.
 
 Classes run in a process that is replaced when one of them takes too long. Lines of JSON go to `--out`, from where a
 second call goes on; the table by sub-library and the reasons go to `--page`.
@@ -34,7 +34,7 @@ from jaxonomy_dae.modelica.packing import components_in
 from jaxonomy_dae.modelica.port_domains import domain_of
 from jaxonomy_dae.modelica.sources import Sources
 
-STAGES = ("found", "opened", "balanced", "translated", "compiled")
+STAGES = ("found", "opened", "translated", "compiled")
 SECONDS = 30  # of processor time, for each class after the first
 MEMORY = 6 << 30  # bytes of memory
 WATER = "redeclare package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater"

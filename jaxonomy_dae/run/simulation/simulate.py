@@ -40,7 +40,7 @@ from .from_state import check_state
 from .integration import Given, Options, Outcome, run, run_compiled
 from .preparation import term_of
 from .saved_state import Memory, SavedState, initial_time
-from .solution import Asked, Solution
+from .solution import Asked, Solution, comparable
 from .step_sizes import clipped, controller_for, scaled_atol
 
 FEW_NUMBERS = 20_000  # on one side of all events: up to so many, states before and after events are kept (160 kB)
@@ -194,6 +194,8 @@ def simulate(
             else search_outside(system, given.t0, given.inputs, given.initial)
         )
     scaled = scaled_atol(system, atol)
+    chosen, tolerances = (None, None) if prescribed else (comparable(solver), (rtol, scaled))
+    asked = Asked(jump_ts, dtmax, max_steps, chosen, tuple(control), tolerances, throw is not False)
     call = _Call(
         system=system,
         given=given,
@@ -212,19 +214,10 @@ def simulate(
         throw=throw,
         known=not is_traced((given, adjoint, stepsize_controller)),
         duration=None if is_traced((t0, t1)) else float(t1) - float(t0),
-        asked=Asked(
-            jump_ts,
-            dtmax,
-            max_steps,
-            None if prescribed else solver,
-            tuple(control),
-            None if prescribed else (rtol, scaled),
-            throw is not False,
-        ).comparable(),  # fmt: skip
+        asked=asked,
     )
-    return (
-        call.traced() if is_traced((given, adjoint, stepsize_controller, rtol, scaled, call.asked)) else call.outside()
-    )
+    # A solver of the user's may hold what is traced, as the tolerance of its root finder.
+    return call.outside() if call.known and not is_traced((solver, rtol, scaled, jump_ts, dtmax)) else call.traced()
 
 
 def _given(system: AcausalSystem, t0: Time, t1: Time, ts: Times, inputs: Args, initial: Any) -> Given:

@@ -1,6 +1,5 @@
 """Solutions: every variable by name."""
 
-import dataclasses
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from html import escape
@@ -47,17 +46,17 @@ class Asked(eqx.Module):
     tolerances: tuple[Tolerance, Tolerance] | None = None  # rtol, and atol of each state
     throw: bool = eqx.field(static=True, default=True)
 
-    def comparable(self) -> "Asked":
-        """The options, without a solver if solutions that name it could not be compared."""
-        solver = self.solver
-        known = not any(eqx.is_array(leaf) for leaf in jax.tree.leaves(solver)) and isinstance(solver, Hashable)
-        return self if known else dataclasses.replace(self, solver=None)
-
     @property
     def options(self) -> dict[str, Any]:
         """The arguments of `simulate`, without tolerances."""
         names = ("jump_ts", "dtmax", "max_steps", "solver", "control")
         return {name: getattr(self, name) for name in names}
+
+
+def comparable(solver: Solver) -> Solver:
+    """The solver; None if solutions that name it could not be compared."""
+    known = not any(eqx.is_array(leaf) for leaf in jax.tree.leaves(solver)) and isinstance(solver, Hashable)
+    return solver if known else None
 
 
 class Solution(eqx.Module):
