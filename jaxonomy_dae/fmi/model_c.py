@@ -53,7 +53,7 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True)
 class CVariable:
-    """A variable as the C code sees it; see `fmi3.c`."""
+    """A variable as the C code sees it; see `instance.c`."""
 
     kind: str
     settable: str
@@ -81,7 +81,7 @@ def _table(declaration: str, entries: Sequence[str]) -> str:
 
 
 # The sizes of a model and the switches of its functions, for `run.c`.
-HAS = ("forward", "event", "step")
+HAS = ("forward", "reverse", "event", "step")
 OF_TEXTS = {"unknowns": "field", "rows": "start", "carried": "event", "events": "event"}  # what has these messages
 
 

@@ -16,7 +16,7 @@ from hybrid_models import Ball, Bob, Doubling, SampledPI, Stick, Thermostat
 from hybrid_models import compiled as hybrid
 from problems import compiled, drag_on, mlp, pendulum
 
-from jaxonomy_dae import Component, EqnEnv, der
+from jaxonomy_dae import Component, EqnEnv, der, terminate
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.fmi import export_fmu
 from jaxonomy_dae.fmi.compilers import FLAGS, compiler_for, this_platform
@@ -192,6 +192,8 @@ def test_what_cannot_be_exported_is_refused_by_name(tmp_path, ball):
         export_fmu(system, tmp_path / "x.fmu", parameters=["b.n"])
     with pytest.raises(ModelError, match="platforms: 'amiga' is not known"):
         export_fmu(system, tmp_path / "x.fmu", platforms="amiga")
+    with pytest.raises(ModelError, match="fmi is the version of FMI, 3 or 2; got 1"):
+        export_fmu(system, tmp_path / "x.fmu", fmi=1)
     with pytest.raises(ModelError, match="kinds: 'simulink' is not known"):
         export_fmu(system, tmp_path / "x.fmu", kinds=["simulink"])
 
@@ -277,6 +279,66 @@ def test_runs_are_those_of_simulate(tmp_path, kind, names, t1):
     compare(system, path, t1, names, 1e-6)
     compare(system, path, t1, names, 1e-6, fmi_type="CoSimulation")
     check_derivatives(system, path, [n for n in names if n not in system.discretes and n not in system.states])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "make, names, t1",
+    [
+        (swing, ["pend.x", "pend.vy", "pend.lam"], 2.0), (lambda: hybrid(Ball, "c"), ["c.h", "c.n"], 3.0),
+        (lambda: hybrid(SampledPI, "c"), ["c.x"], 2.05), (lambda: hybrid(House, "c"), ["c.air", "c.q"], 30.0),
+    ],
+    ids=["pendulum", "ball", "loop", "house"],
+)  # fmt: skip
+def test_runs_in_version_2(tmp_path, make, names, t1):
+    """Constraints and a network's weights, events, a clock as time events, an implicit equation with inputs."""
+    system = make()
+    path = exported(system, tmp_path, fmi=2)
+    compare(system, path, t1, names, 1e-6)
+    compare(system, path, t1, names, 1e-6, fmi_type="CoSimulation")
+    check_derivatives(system, path, [n for n in names if n not in system.discretes and n not in system.states])
+    with zipfile.ZipFile(path) as file:
+        file.extractall(tmp_path / "fmu")
+    command = [*(compiler_for(this_platform()) or ()), *FLAGS, "-Wall", "-Wextra", "-Werror", "-O0"]
+    done = subprocess.run(
+        [*command, "fmi2.c", "-o", "x.so", "-lm"], cwd=tmp_path / "fmu/sources", capture_output=True, text=True
+    )
+    assert not done.returncode, done.stderr
+
+
+@pytest.mark.slow
+def test_what_version_2_does_with_states_and_the_end_of_a_run(tmp_path):
+    """A state of the FMU is taken up bit for bit; an event that ends the run ends it for Co-Simulation, too."""
+    with opened(exported(hybrid(Ball, "b"), tmp_path, fmi=2)) as fmu:
+        state = fmu.model.getFMUstate()
+        saved = fmu.model.serializeFMUstate(state)
+
+        def on():
+            fmu.model.enterContinuousTimeMode()
+            fmu.model.setTime(0.5)
+            fmu.model.setContinuousStates(np.array([-1e-9, -4.4]).ctypes.data_as(model_pointer()), 2)
+            assert fmu.model.completedIntegratorStep()[0]
+            fmu.model.enterEventMode()
+            fmu.update()
+            return fmu.get("b.h", "b.v", "b.n", "events.guard[1]")
+
+        first = on()
+        assert first[2] == 1.0
+        fmu.model.setFMUstate(fmu.model.deSerializeFMUstate(saved))
+        assert fmu.get("b.n")[0] == 0.0
+        np.testing.assert_array_equal(on(), first)
+
+    class Ending(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x = self.variable("x", start=0.0, fixed=True)
+            self.add_equations(Eq(der(x), 1.0))
+            self.when(x >= 0.7, terminate("x is large"))
+
+    path = exported(compiled(Ending(EqnEnv(), "c")), tmp_path, "ending", fmi=2)
+    for kind in "ModelExchange", "CoSimulation":
+        found = run(path, 2.0, ["c.x"], fmi_type=kind)
+        assert found["c.x"][-1] == pytest.approx(0.7, abs=1e-6)
 
 
 @pytest.mark.slow

@@ -18,8 +18,7 @@ from fmus import fmpy
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
 from jaxonomy_dae.fmi import FmuComponent
-from jaxonomy_dae.fmi.compilers import FLAGS, compiler_for, this_platform
-from jaxonomy_dae.fmi.described import FOLDERS_OF_FMI_2
+from jaxonomy_dae.fmi.compilers import FLAGS, FOLDERS_OF_FMI_2, compiler_for, this_platform
 
 SOURCES = os.environ.get("REFERENCE_FMUS", "")
 pytestmark = [
