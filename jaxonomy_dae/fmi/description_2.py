@@ -1,4 +1,4 @@
-"""`modelDescription.xml` of FMI 2.0, which has scalars only, numbers variables from one, and counts event indicators."""
+"""`modelDescription.xml` of FMI 2.0: variables are scalars, numbered from one; event indicators are counted."""
 
 from collections.abc import Sequence
 from xml.sax.saxutils import quoteattr

@@ -64,8 +64,9 @@ def export_fmu(
 
     **Raises:**
 
-    - `ModelError` for a name or a version that does not exist, a file that exists, a batch of systems, single precision, an input
-        that the model differentiates, and a function with operations that cannot be written in C, with its line.
+    - `ModelError` for a name or a version that does not exist, a file that exists, a batch of systems, single
+        precision, an input that the model differentiates, and a function with operations that cannot be written in C,
+        with its line.
     - `MissingPackage` for a binary of another machine's platform, without Zig.
 
     Source: Functional Mock-up Interface 3.0 and 2.0 (Modelica Association, 2022 and 2014, fmi-standard.org).

@@ -5,8 +5,9 @@ blocks, discrete values, parameters, inputs, and the arrays of networks. `Progra
 (`jax.make_jaxpr`):
 
 - `field`, `outputs`, `guards`: dx/dt, the variables that are read, and the guards of conditions.
-- `forward`, `reverse`: the directional and the adjoint derivative of these three, one after another, by (t, x, p, u,
-  *weights). Nonlinear blocks are differentiated by the implicit function theorem.
+- `unsolved`: the same, with the residuals of nonlinear blocks in place of their solution.
+- `forward`, `reverse`: the directional and the adjoint derivative of `field`, `outputs` and `guards`, one after
+  another, by (t, x, p, u, *weights). Nonlinear blocks are differentiated by the implicit function theorem.
 - `start`: the consistent point at the initial time, after the events that happen there.
 - `event`: what happens at an instant, by the map that a run uses.
 - `step`: a step of Rodas5P, with its error and its dense output, for Co-Simulation.
@@ -126,6 +127,18 @@ class Programs:
     def unknowns(self, *point: Array) -> Array:
         """The field, the outputs and the guards, shape (nx + ny + ng,)."""
         return jnp.concatenate([self.field(*point), self.outputs(*point), self.guards(*point)])
+
+    def unsolved(
+        self, t: Array, x: Array, z: Array, q: Array, p: Array, u: Array, *weights: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """At any z, whether the equations of nonlinear blocks hold or not: (dx/dt, the residuals of these equations,
+        the continuous outputs, the guards)."""
+        here = self.at(p, weights).holding(q).at(t, self.args(u))
+        whole, none = jnp.concatenate([x, z]), jnp.zeros((0,), self.p.dtype)
+        found = here.semi_explicit(whole)
+        outputs = here.quantities(whole, *self._quantity, Refinement.NONE) if self.ny else none
+        guards = here.guards(whole, Refinement.NONE) if self.ng else none
+        return found[: self.nx], found[self.nx :], outputs, guards
 
     def _moving(self, z: Array, q: Array) -> Callable[..., Array]:
         """`unknowns` of what they are differentiated by."""
@@ -285,6 +298,7 @@ class Programs:
             "field": (self.field, (*point, *weights)),
             "outputs": (self.outputs, (*point, *weights)),
             "guards": (self.guards, (*point, *weights)),
+            "unsolved": (self.unsolved, (*point, *weights)),
             "forward": (
                 lambda z, q, *both: self.forward(z, q, both[: len(moving)], both[len(moving) :]),
                 (n["z"], n["q"], *moving, *moving),

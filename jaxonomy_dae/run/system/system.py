@@ -592,6 +592,13 @@ class AcausalSystem(eqx.Module):
             overwrite=overwrite,
         )  # fmt: skip
 
+    def to_casadi(self, *, outputs: Sequence[str] | None = None) -> Any:
+        """This system as a `casadi.Function` of time, states, algebraic unknowns, discrete values, parameters and
+        inputs: see `jaxonomy_dae.fmi.to_casadi`, which has the same argument."""
+        from ...fmi.to_casadi import to_casadi
+
+        return to_casadi(self, outputs=outputs)
+
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
         if isinstance(solve_for, str):
             raise ModelError(f"solve_for is a list of parameters' names; write solve_for=[{solve_for!r}]")
