@@ -40,6 +40,7 @@ def take(array: Numeric, index: np.ndarray) -> Numeric:
     if n == array.shape[0] and index[0] == 0 and np.array_equal(index, np.arange(n)):
         return array
     if n > 1:
+        # A slice is cheaper than a gather, and its transpose is a pad rather than a scatter.
         step = int(index[1] - index[0])
         if step > 0 and np.array_equal(index, index[0] + step * np.arange(n)):
             return jax.lax.slice(array, (int(index[0]),), (int(index[-1]) + 1,), (step,))
@@ -87,6 +88,7 @@ class Gather:
     def _from_several(self, chunks: list[Chunk], dtype) -> Numeric:
         breaks = np.flatnonzero((np.diff(self.chunk) != 0) | (np.diff(self.offset) != 1)) + 1
         used = distinct(self.chunk)
+        # Values that come in few runs are sliced and joined. Concatenating all sources first costs their whole length.
         if len(breaks) < len(used) + GATHER:
             runs = np.split(np.arange(len(self.chunk)), breaks)
             return joined([self._run(chunks, run, dtype) for run in runs])

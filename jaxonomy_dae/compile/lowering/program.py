@@ -39,6 +39,7 @@ class Layout:
         chunk[~zero], offset[~zero] = self.chunk[quantity[~zero]], self.offset[quantity[~zero]]
         if (chunk == -2).any():
             raise AssertionError("a quantity is read before it is computed")
+        # Zero is read as such, whatever the factor. A factor of one for all lets it be left out.
         factor = np.where(factor == 0, 1.0, factor)
         return [Gather(*row) for row in zip(chunk, offset, factor, strict=True)]
 
@@ -172,6 +173,7 @@ def _plan_loop(loop: Loop, layout: Layout) -> PlannedLoop:
     for p, step in enumerate(loop.body):
         for u in range(len(step.unknown)):
             chunk_of[p, u] = 2 + len(chunk_of)
+    # A scan hands on values of the last repetition only.
     # A register holds a value of `back` repetitions ago; it is filled from the register of one less.
     registers: dict[tuple[int, int, int, int], int] = {}
     first: list[int] = []

@@ -62,6 +62,7 @@ class Starts(Sequence[Start | None]):
 
     def __init__(self, n: int, groups: Sequence[Formulas]):
         self.groups = tuple(groups)
+        # An object for each start would take more memory than all other tables of a large model.
         self._place = np.full((n, 2), -1, np.int32)
         for k, group in enumerate(self.groups):
             self._place[group.target] = np.stack([np.full(len(group.target), k), np.arange(len(group.target))], 1)

@@ -61,6 +61,7 @@ def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndar
     v = np.flatnonzero(starts.is_given & (model.variables.quantity >= 0))
     values = starts.values(parameters)
     # A start that is computed may be rounding alone, as L·sin(π) is; a number that is given is what it is.
+    # How a start answers to small changes of its parameters shows how large its terms are.
     moved = starts.values(parameters * (1 + MOVED * generic(np.random.default_rng(1), parameters.shape)))
     values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
     quantity, value = model.variables.quantity[v], values[v] / model.variables.factor[v]
@@ -76,6 +77,8 @@ def _lost_beside_others(values: np.ndarray, units: list[str], variables: np.ndar
     sizes = np.where(np.isfinite(values), np.abs(values), 0.0)
     small = (sizes > 0) & (sizes <= KNOWN * sizes.max(initial=0.0))
     lost = np.zeros(len(variables), bool)
+    # Only within one unit: a charge of 1e-18 C beside a resistance of 1e6 Ω is not a rounding error. Without units
+    # nothing can be compared.
     for unit in {units[k] for k in variables[small].tolist()} - {""}:
         same = np.array([units[k] == unit for k in variables.tolist()])
         lost |= same & (sizes <= KNOWN * sizes[same].max())
@@ -122,5 +125,6 @@ def _balanced(
         while len(balance.found) >= ROOM:
             balance.found.pop(next(iter(balance.found)), None)
         balance.found[key] = 10.0 ** np.clip(np.log10(np.abs(sizes)), -DECADES, DECADES)
+        # The array is handed to all who ask; one that changed it would change the sizes of all others.
         balance.found[key].flags.writeable = False
     return balance.found[key]
