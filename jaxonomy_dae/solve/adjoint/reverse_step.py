@@ -33,7 +33,8 @@ class ReverseStep:
             "save_ts": [taken(f, c) for f, c in zip(perturbed["save_ts"], numbers["save_ts"], strict=True)],
         }
         self.ts_wanted = perturbed["ts"]
-        # The parts of `SaveAt` whose saved rows have a cotangent.
+        # The parts of `SaveAt` whose saved rows have a cotangent: functions that save what nobody reads are left out of
+        # the program.
         live = [i for i, saved in enumerate(self.saved) if jax.tree.leaves(saved)]
         self.save_steps = [i for i in live if program.every[i]]
         self.save_ts = [i for i in live if program.save_ts[i] is not None]
@@ -155,6 +156,7 @@ class ReverseStep:
             index, at, *new = unless_waiting(here, (index - 1, at - 1, *new), old)
             return index, at, *new, new_ts
 
+        # From the last saved time of the step to the first: the index into the times goes down with the rows.
         start = (carry["index"][i], carry["row"][i], dense_ct, ends_ct, carry["save_ts"][i], carry["ts"][i])
         loop = lax.while_loop(lambda loop: any_member(inside(loop[0])), one, start)
         index, at, dense_ct, ends_ct, consts_ct, ts_ct = loop

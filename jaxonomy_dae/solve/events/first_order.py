@@ -64,5 +64,7 @@ def _refused_one(primals, tangents):
     return _refused((jnp.ones_like(primals[0]),), tangents)
 
 
+# With zeros as arrays, as JAX hands them over by default, forward mode over reverse mode would be refused even where
+# nothing of the event moves.
 _not_again.defjvp(_refused, symbolic_zeros=True)
 _one.defjvp(_refused_one, symbolic_zeros=True)

@@ -117,6 +117,8 @@ def path_end(
         )
 
     def attempted(path: _Path) -> _Path:
+        # The order is raised until two columns agree. A jump is found to ten digits, for which a method of fixed order
+        # would take many pieces.
         columns = jnp.zeros((len(SUBSTEPS), len(x)), dtype)
         yes = jnp.ones((), bool)
         piece = _Piece(path.x, path.x, columns, path.x, path.guess, ~yes, yes, yes)

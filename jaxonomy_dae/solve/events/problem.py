@@ -77,6 +77,7 @@ class AbstractHybridProblem(eqx.Module):
         """The time of the next tick of each clock, given the number of ticks so far."""
         period, offset = self.clocks()
         ticks = lax.stop_gradient(ticks)
+        # An event that happens once has an infinite period, and zero times infinity is not a number.
         return offset + jnp.where(ticks == 0, 0.0, ticks * period)
 
     def slope(self, t: Time, x: State, q: Array, args: Args) -> Float[Array, " n"]:

@@ -120,6 +120,7 @@ class WithEvents(WrappedSolver):
         def events(state):
             return handle(problem, t1, state, arrival, args, noted)
 
+        # Where all events are kinks, what happens is a few selects. No branch is needed, and no slope.
         if problem.facts.only_kinks:
             then, _ = problem.at_instant(args)
             y1, slope = turned(problem, t1, state, values, arrival.due, then), jnp.zeros_like(x1)
@@ -130,6 +131,7 @@ class WithEvents(WrappedSolver):
         dense_info = dict(
             inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution, **{NOTED: noted}
         )
+        # A step that failed by itself keeps its own result: that x1 is not finite says nothing of the event.
         finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
         result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)

@@ -28,6 +28,7 @@ class Mass:
                 "the mass matrix of a DAETerm is constant: it cannot be traced. Move what varies into F, or solve for "
                 "other variables"
             ) from None
+        # A matrix that is diagonal is kept as such: products are cheaper, and sparse steps need it.
         if array.ndim == 2 and array.shape[0] == array.shape[1] and not (array - np.diag(np.diag(array))).any():
             array = np.diag(array).copy()
         square = array.ndim == 1 or (array.ndim == 2 and array.shape[0] == array.shape[1])

@@ -127,6 +127,8 @@ class FlatProblem:
     """A term as solvers use it: M dy/dt = F(t, y) for a flat y, in the direction of integration."""
 
     def __init__(self, terms: Terms, y: State, args: Args):
+        # Diffrax integrates forwards and wraps the term for a run backwards. Its wrapper knows nothing of mass and
+        # constraint.
         self.term, self.direction = unwrapped(terms)
         self.args = args
         self.terms = terms

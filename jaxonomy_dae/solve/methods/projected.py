@@ -73,6 +73,7 @@ class Projected(WrappedSolver):
             y_error = jax.tree.map(lambda e, m: jnp.abs(e) + m, y_error, moved)
         if self.guard is not None:
             if made_jump is not False:
+                # Behind a jump the state may be on another branch, where the determinant has another size and sign.
                 largest = jnp.where(made_jump, self.guard.measure(t0, y0, args), largest)
             verdict = self.guard.judge(largest, t1, projected, args)
             if y_error is not None:
