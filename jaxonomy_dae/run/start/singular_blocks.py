@@ -58,6 +58,7 @@ def _plan_check(plan: SystemPlan) -> _Check:
             examined.add(k)
             wanted[step.needs()[step.needs() != ZERO]] = True
             continue
+        # These are nearly all steps of a model, and nothing of them can be singular.
         if len(step.unknown) == 1 and all(_never_vanishes(e) for e in step.equations):
             continue
         examined.add(k)
@@ -134,6 +135,8 @@ def examine_blocks(
                 if not rank.is_regular:
                     return
             if step.whole and not step.carried:
+                # Behind a block that is solved, others are judged at its solution, for their coefficients may depend on
+                # it.
                 known.put(block.unknown, rank.solve(-block.residual(known)))
     yield from _constraints(plan, known)
 

@@ -89,6 +89,7 @@ def find_root(
         sizes = [jnp.where(least == jnp.inf, a, b) for a, b in zip(own, sizes, strict=True)]
         off = [jnp.abs(r) / jnp.where(s > 0, s, 1) for r, s in zip(residuals, sizes, strict=True)]
         largest = functools.reduce(jnp.maximum, off)
+        # A block that stays whole has one verdict for all of its equations.
         largest = jnp.max(largest) if len(batch) < jnp.ndim(largest) else largest
         falls = (largest <= (1 - part / 4) * least) | (least <= SURE)
         return Tried(falls, holds, step, (largest, sizes))

@@ -107,6 +107,7 @@ def fastest_decay(model: ReducedModel, parameters: np.ndarray) -> float:
         return 0.0
     found: Any = _fast_rates(matrix, below)
     found = found[np.abs(found) > RANK * np.abs(found).max(initial=0.0)]  # an oscillator's zero is no decay
+    # Fast oscillations have to be followed by any solver: an implicit one would gain nothing.
     decays = -found.real[-found.real > np.abs(found.imag)]
     return float(decays.max(initial=0.0))
 

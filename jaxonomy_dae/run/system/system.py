@@ -375,6 +375,8 @@ class AcausalSystem(eqx.Module):
         if not self.plan.n_projected:
             return self.project(t, x, args, iterations)
         near = self.project(t, x, args, iterations - 1)
+        # Judged by the last step rather than by residuals: these have units, and the length of a step is that of the
+        # states.
         found = self.project(t, near, args)
         short = jnp.abs(found - near) <= CONSISTENT * (jnp.abs(found) + self.state_sizes)
         return jnp.where(jax.lax.stop_gradient(jnp.all(short)), found, jnp.nan)
@@ -436,6 +438,7 @@ class AcausalSystem(eqx.Module):
         if is_staged((self, t, x, args)):
             values = self.at(t, args).quantities(x, quantity, factor)
             return values[0] if single else values
+        # Padded to a power of two, so that reading three variables and reading four are one program.
         n, dtype = 1 << (len(quantity) - 1).bit_length(), self.parameters.values.dtype
         padded = on_device(np.resize(quantity, n)), on_device(np.resize(factor, n), dtype)
         values = _observed(dataclasses.replace(self, stiffness=None), on_device(t, dtype), on_device(x), args, *padded)

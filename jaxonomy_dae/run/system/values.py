@@ -108,6 +108,7 @@ class Values:
     def _entry(self, name: str, k: int) -> Array:
         """An entry of the parameters or of the typical sizes, a scalar."""
         array = getattr(self, name)
+        # Splitting an array makes all of its entries scalars of the program, so only short ones are split.
         if array.shape[0] > FEW:
             return array[k]
         if name not in self._scalars:
@@ -154,11 +155,14 @@ class Values:
             weights = -group.coefficient[:, outside] / group.coefficient[:, [positions[0]]]
             return scaled_by(1 / planned.factors[positions[0]], self.long_sum(planned, outside, weights), self.dtype)
         local = list(local)
+        # A Python number, which is folded while the program is traced: the residual at zero is what the equation is
+        # solved from.
         local[unknown] = 0.0
         at = self.equation(planned, local)
         if len(positions) == 1:
             value = group.template.solve(positions[0], *at.arguments)
             return scaled_by(1 / planned.factors[positions[0]], value, self.dtype)
+        # The unknown stands in several slots: the template cannot be solved for one of them.
         return -at.residual() / at.slope(unknown, at.partials())
 
     def long_sum(self, planned: PlannedEquation, positions: Sequence[int], weights: np.ndarray) -> Array:
