@@ -70,6 +70,7 @@ class Dependencies:
         self.segments: list[ColumnSets] = []
         self.entries = 0
         self.residuals: list[ColumnSets] = []  # of nonlinear blocks, in the order of the algebraic unknowns
+        # Segment 0, where row k is the set of k alone: what is read from the state array refers to it.
         single = ColumnSets(np.arange(self.width + 1), np.arange(self.width, dtype=np.int32))
         self._store(single, [plan.states])
 

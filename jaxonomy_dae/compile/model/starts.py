@@ -75,6 +75,7 @@ class Starts(Sequence[Start | None]):
     @property
     def is_number(self) -> np.ndarray:
         """True for variables that have a start which no parameter changes."""
+        # Variables without a start have the place −1, which reads the last entry.
         number = [group.parameter.shape[1] == 0 for group in self.groups]
         return np.array([*number, False], bool)[self._place[:, 0]]
 
