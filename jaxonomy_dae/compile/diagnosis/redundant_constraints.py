@@ -133,8 +133,8 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
         return []
     if sampled is None or len(rows) <= DECOMPOSED_UPTO:
         rank = rank_of(matrix.toarray(), bounds.toarray())
-        # A constant Jacobian has the digits of its entries. Any other one is taken at a point that a search found,
-        # where the singular values of dependent rows are far from zero to rounding.
+        # A constant Jacobian has all digits of its entries. Any other one is taken at a point that is known to half of
+        # the digits, and singular values of rows that depend on each other are no smaller.
         number = rank.number if entries.constant.all() else int((rank.s > HALF_OF_THE_DIGITS * rank.s[0]).sum())
         row_scale, column_scale, left, right = rank.r, rank.c, rank.u[:, number:], rank.vt[number:].T
         right = right if sampled is None else sampled.right / column_scale[:, None]

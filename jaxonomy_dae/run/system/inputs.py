@@ -159,6 +159,7 @@ def _constant(name: str, value: Any, dtype: Any) -> Any:
     if isinstance(value, str):
         raise ModelError(f"input '{name}' must be a number, samples or a function of time; got the text {value!r}")
     try:
+        # By NumPy where the value is known, since JAX would compile a program for the conversion.
         array = jnp.asarray(value) if is_traced(value) else np.asarray(value)
         if array.dtype.kind not in "biufcV":  # V: numbers of eight bits and the like
             raise TypeError

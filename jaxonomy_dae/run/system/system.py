@@ -364,6 +364,7 @@ class AcausalSystem(eqx.Module):
             )
         point = self.at(t, args)
         if len(self.plan.carried):
+            # The unknowns of nonlinear blocks are refined, and entries stay derivatives by the state that was given.
             x = jax.lax.stop_gradient(point.refined(x, Refinement.ROOT)) + (x - jax.lax.stop_gradient(x))
         return SparseMatrix(sparse_jacobian(point.vector_field, pattern)(x), pattern)
 

@@ -96,6 +96,7 @@ class Values:
         other = copy.copy(self)
         parts = self.chunks, self.parameters, self.t, self.networks.weights
         other.chunks, other.parameters, other.t, weights = still(parts)
+        # Entries and outputs of networks that were remembered are differentiated ones.
         other.networks, other._scalars = Networks(weights), {}
         return other
 
@@ -131,6 +132,8 @@ class Values:
             coefficients: list[Scalar] = [float(c) for c in group.coefficient[0]]
         else:
             parameters = [
+                # A parameter that all instances share stays a scalar. Gathered, it would be copied for each of them,
+                # and reverse mode would scatter into all parameters.
                 self._entry("parameters", int(column[0]))
                 if (column == column[0]).all()
                 else take(self.parameters, column)
@@ -148,6 +151,8 @@ class Values:
     def solved(self, planned: PlannedEquation, unknown: int, local: list[Any]) -> Array:
         """The local unknown for which the equation, affine in it, holds."""
         group = planned.equation
+        # Slots with numeric coefficients are one product of arrays where they are many: written out, each term is an
+        # operation of the program.
         positions = [k for k, u in enumerate(group.local) if u == unknown]
         outside = [k for k in range(len(group.local)) if k != positions[0]]
         is_long = isinstance(group.template, LinearTemplate) and len(outside) >= LONG_SUM
