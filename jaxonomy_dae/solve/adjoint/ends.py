@@ -89,6 +89,7 @@ class Ending(diffrax.AbstractAdaptiveStepSizeController):
         return Ending(self.controller.wrap(direction), tuple(end.wrap(direction) for end in self.ends))  # pyright: ignore[reportCallIssue]
 
     def _inside(self, terms, y):
+        # From the outermost end inwards: each sees what the ones around it have left of the state.
         for end in reversed(self.ends):
             terms, y = end.inside(terms, y)
         return terms, y

@@ -110,6 +110,7 @@ class ReverseStep:
 
     def _saved_step(self, carry, i, kept, y1):
         """Pulls back the cotangents of the values saved at the end of the step."""
+        # Which steps were saved follows from their count, so that no row has to record it.
         here = kept & (carry["accepted"] % self.program.every[i] == 0)
         at = carry["row"][i] - 1
         t, move = carry["after"]
@@ -148,6 +149,7 @@ class ReverseStep:
             _, pull = jax.vjp(saved, t, (row["tprev"], row["tnext"]), dense, consts)
             by_t, *by = pull(ct)
             new = jax.tree.map(jnp.add, (dense_ct, ends_ct, consts_ct), (by[1], by[0], by[2]))
+            # The time is saved beside the value: its own cotangent adds to that of the value by the time.
             if ts_ct is not None:
                 new_ts = ts_ct.at[index - 1].add(unless_waiting(here, by_t + t_ct, jnp.zeros_like(by_t)))
             else:

@@ -37,6 +37,8 @@ def differentiable_once(value):
 @differentiable_once.defjvp
 def _(primals, tangents):
     (value,), (tangent,) = primals, tangents
+    # A tangent does not depend on the value, so that a second derivative would be zero without a word. The factor,
+    # which is one, refuses it.
     return differentiable_once(value), tangent * _one(value)
 
 

@@ -25,6 +25,8 @@ ATTEMPTS = 40  # pieces that are tried: each is half or twice as long as the one
 def _weights() -> np.ndarray:
     """For each column, the weights of it and those before it in the value for substeps of no length: an even polynomial
     in the substep, at zero."""
+    # By the squares of the numbers of substeps: errors of the midpoint rule have even powers alone, so that each column
+    # raises the order by two.
     n = np.array(SUBSTEPS, float) ** 2
     out = np.zeros((len(n), len(n)))
     for k in range(len(n)):

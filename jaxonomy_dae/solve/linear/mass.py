@@ -37,6 +37,7 @@ class Mass:
                 f"mass must be a finite square matrix (n, n), or its diagonal (n,); got shape {array.shape}"
                 + ("" if np.isfinite(array).all() else " with entries that are not finite")
             )
+        # The digest and what is cached below follow from the entries.
         array.setflags(write=False)
         self.array = array
         self._digest = hashlib.sha256(array.tobytes() + repr(array.shape).encode()).hexdigest()
@@ -69,6 +70,7 @@ class Mass:
         if self.is_diagonal:
             return (self.array == 0).astype(float)
         u, s, _ = np.linalg.svd(self.array)
+        # By singular values rather than by rows of zeros: an algebraic equation may be a combination of rows.
         null = u[:, s <= s.max(initial=0.0) / ILL_CONDITIONED]
         return null @ null.T
 

@@ -94,6 +94,7 @@ class SparsePattern:
 
     def merged(self, values: Float[Array, " nnz"]) -> tuple["SparsePattern", Float[Array, " places"]]:
         """The pattern with every place once, and the values there; values at the same place add up."""
+        # Mostly every place occurs once, in order, and the values go to KLU as they are.
         if self.coalesced is None:
             return self, values
         pattern, inverse = self.coalesced

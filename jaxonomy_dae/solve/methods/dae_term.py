@@ -101,6 +101,7 @@ class DAETerm(diffrax.AbstractTerm):
         return self.mass
 
 
+# Masses are compared by content and hashed once, so that one object serves all solves of a size.
 @functools.lru_cache(maxsize=64)
 def _split_mass(n: int, m: int) -> Mass:
     return Mass(np.concatenate([np.ones(n), np.zeros(m)]))

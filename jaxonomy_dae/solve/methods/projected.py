@@ -68,6 +68,8 @@ class Projected(WrappedSolver):
             terms, t0, t1, y0, args, solver_state, made_jump
         )
         projected = self.projection(t1, y1, args)
+        # To the error that the solver estimates, since either alone may be small: a step onto another branch has a
+        # small error and a long way back.
         if self.strict and y_error is not None:
             moved = jax.tree.map(lambda a, b: jnp.abs(a - b), projected, y1)
             y_error = jax.tree.map(lambda e, m: jnp.abs(e) + m, y_error, moved)
