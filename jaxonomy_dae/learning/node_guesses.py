@@ -1,5 +1,8 @@
-"""Where the states at the nodes begin: at smoothed samples of those that were measured, and of their derivatives; else
-where runs of the segments before them end."""
+"""First guesses of the states at the nodes.
+
+Where a state or its derivative was measured, the guess is a smoothed sample. Elsewhere it is the state at which the run
+of the segment before ends.
+"""
 
 from collections.abc import Sequence
 

@@ -139,6 +139,7 @@ def plan(
     place[carried] = len(states) + np.arange(len(carried))
     next_chunk = 2
     planned = []
+    # Loops are found first: of a chain that has become one sparse system, repetitions can no longer be seen.
     for step in merge_thin(find_loops(steps, n_quantities), n_quantities, DENSE_UPTO):
         layout = Layout(chunk, offset)
         if isinstance(step, Loop):
@@ -146,6 +147,7 @@ def plan(
             unknown = [quantities.ravel() for each in step.unknown for quantities in each]
         elif isinstance(step, SparseStep):
             unknown = step.unknown
+            # Before it is planned, since its equations read its own unknowns as a chunk.
             chunk[unknown[0]], offset[unknown[0]] = next_chunk, np.arange(step.n)
             planned.append(_plan_sparse(step, layout, place, linear_solver))
         else:

@@ -69,6 +69,7 @@ def _plan_check(plan: SystemPlan) -> _Check:
     settled = plan.selection.settled
     for planned in plan.constraints:
         wanted[settled[np.isin(settled, planned.equation.quantity)]] = True
+    # Backwards, since what a step needs is computed by those before it.
     for k in reversed(range(len(plan.steps))):
         step = plan.steps[k]
         if any(wanted[q].any() for q in step.unknown):
@@ -173,6 +174,7 @@ def _follow(step: Step, known: Known):
 def _solve(step: Step, known: Known):
     """Computes the unknowns of a linear step."""
     for quantities in step.unknown:
+        # At zero the residual of a linear step is its right-hand side.
         known.put(quantities, 0.0)
     residual = np.stack([equation.residual(known.at) for equation in step.equations], axis=-1)
     try:

@@ -66,6 +66,7 @@ class Evaluation(Values):
         matrix: dict[tuple[int, int], Scalar] = {}
         right = []
         shape = () if planned.step.n == 1 else (planned.step.n,)
+        # Python's zeros, so that products with unknowns are left out of the residual while the program is traced.
         blank = [0.0] * len(planned.step.unknown)
         for e, equation in enumerate(planned.equations):
             rest, slopes = self._affine_parts(equation, blank)

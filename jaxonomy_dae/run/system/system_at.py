@@ -146,6 +146,7 @@ class SystemAt:
             return jax.jvp(self.carried_vector, (self.t, self._chunk(x)), (jnp.ones_like(self.t), moved))[1]
 
         if plan.carried_pattern is None:
+            # Affine in the rates, so that one Newton step from zero solves it.
             _, rates = newton_step(lambda rates: entries(along(tuple(rates))), [jnp.zeros((), self.dtype)] * m)
             return tuple(rates)
         matrix = sparse_jacobian(lambda z: self.carried_vector(self.t, jnp.append(x[:n], z)), plan.carried_pattern)(
@@ -208,6 +209,7 @@ class SystemAt:
             pattern = SparsePattern(rows, cols, plan.n_state, n_rows=m)
             jacobian = pattern.dense(sparse_jacobian(g, pattern)(x))
         else:
+            # Reverse mode takes a pass for each row, which costs more than a pass of forward mode for a column.
             jacobian = (jax.jacrev if 4 * m < n else jax.jacfwd)(g)(x)
         jacobian = jacobian * jnp.asarray(plan.nominal, self.dtype)
         size = jnp.sqrt(jnp.sum(jacobian**2, axis=1, keepdims=True))

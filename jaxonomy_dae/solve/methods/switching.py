@@ -57,7 +57,7 @@ class Watch(eqx.Module):
         """The counts after a step from t0 to t1, whose last two stages are at points y with increments k = h·f(y)."""
         end, floor, t0, t1, y, k = jax.lax.stop_gradient((self.end, self.floor, t0, t1, y, k))
         weight = floor + jnp.abs(y[1])
-        # One sum, not one for each norm: small steps cost what the kernels in them are.
+        # One sum rather than two norms that are compared: a small step costs as much as it has kernels.
         excess = jnp.sum(((k[1] - k[0]) ** 2 - BOUNDARY**2 * (y[1] - y[0]) ** 2) / weight**2)
         count, steps = counts[0], counts[1]
         left = (self.many - steps if self.of_run else jnp.full_like(steps, self.many)).astype(jnp.asarray(t1).dtype)
