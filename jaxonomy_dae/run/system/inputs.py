@@ -249,6 +249,7 @@ def _column(name: str, which: str, values: Any, dtype: Any, shape: tuple[int, ..
         index = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
         where = ", ".join(map(str, index))
         raise ModelError(f"input '{name}': {which}[{where}] is {array[index]}; leave the sample out")
+    # A copy: JAX may share memory with NumPy's array, to which its owner may write later.
     return jnp.array(array, dtype, copy=True)
 
 
