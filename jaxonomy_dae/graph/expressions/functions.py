@@ -117,7 +117,7 @@ def _hypot(xp):
 
     def function(a, b):
         square = a * a + b * b
-        # √0 has an infinite slope, of which a gradient keeps ∞·0 though its branch is not taken.
+        # √0 has an infinite slope, and a gradient keeps ∞·0 of it, which is no number, though its branch is not taken.
         away = square > 0
         return xp.where(away, xp.sqrt(xp.where(away, square, 1.0)), 0.0)
 

@@ -32,8 +32,8 @@ class Node:
     leaves: frozenset
 
     def __reduce__(self):
-        # Pickle would recurse through arguments, which deep graphs are too deep for. A table has no depth, and reading
-        # it by `make` keeps nodes unique in the process that reads.
+        # Pickle would recurse through arguments, and deep graphs exceed its limit. A table has no depth, and reading it
+        # by `make` keeps nodes unique in the process that reads.
         order: list[Node] = postorder([self])
         place = {n: k for k, n in enumerate(order)}
         rows = tuple((n.operation, tuple(place[a] for a in n.arguments), n.data) for n in order)
