@@ -139,4 +139,5 @@ class Linearized:
         return np.einsum("mf,mfq->mq", self.along.read[experiment, row, output], moved[experiment, row])
 
 
-NO_MORE = 1e-6  # of a state's size: by how much the slope of another may differ and still be this state
+# Of a state's size. A slope that differs from another state by no more than this is that state.
+NO_MORE = 1e-6

@@ -13,7 +13,8 @@ from ..compile.lowering.plan import SystemPlan
 from .segments import Segments
 
 FEWEST = 5  # samples to smooth: two more than a parabola has coefficients
-SETTLED = 1e-3  # of a state's size, by which sweeps may still move nodes
+# Sweeps end where they move nodes by no more than this part of a state's size.
+SETTLED = 1e-3
 
 
 def measured_states(segments: Segments) -> Float[np.ndarray, "e N n"]:

@@ -15,7 +15,8 @@ from .natural_sizes import Factors, constants, natural_sizes
 from .quantities import ReducedModel
 
 MOVED = 1e-6  # of parameters: a difference from which a slope is told to six digits
-DECADES = 30  # that they may span: single precision has 38
+# Typical sizes lie within so many decades of one: single precision has 38.
+DECADES = 30
 ROOM = 4  # answers kept for one model: at the values it was compiled with, at those it is run with, and two between
 
 

@@ -24,7 +24,8 @@ from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenances
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, VariableTable
 
-DECADES = 30.0  # that factors span at most: single precision has 38
+# Factors of aliases lie within so many decades of one: single precision has 38.
+DECADES = 30.0
 COMPARED = 4  # terms of an equation that are compared with each other: sorting all terms of a large model takes longer
 SWEEPS = 8  # after which equations of any length are looked at one by one
 

@@ -28,7 +28,8 @@ from ..model.tables import ZERO, EquationGroup, equation_offsets
 from ..model.typical_sizes import typical_sizes, unrounded_sizes
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
-POORER_PIVOT = 1e-3  # so much smaller if the better ones would all be of preferred states
+# If all good pivots are states that the user prefers, one that is so much smaller takes their place.
+POORER_PIVOT = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)

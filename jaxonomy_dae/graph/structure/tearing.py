@@ -16,8 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-GROWTH = 100.0  # of an error in a tearing variable, in equilibrated units
-LINKS = 1  # in rows whose growth depends on parameters or the state: they may change after the choice was made
+# An error in a tearing variable may grow so much along the sequence, in equilibrated units.
+GROWTH = 100.0
+# An unknown may follow by so many links whose growth depends on parameters or on the state. These may change after the
+# choice was made.
+LINKS = 1
 EQUILIBRATIONS = 4  # passes: entries need only be alike to a factor that is small beside GROWTH
 
 

@@ -27,7 +27,8 @@ from .rows import InitialRows, StartRow, initial_rows
 from .search import Look
 from .sizes import Sizes
 
-PERTURBATIONS = 8  # of the start, and of parameters, that show the sizes of terms
+# Patterns of small changes of the start and of parameters, which show how large terms are.
+PERTURBATIONS = 8
 
 
 class InitialProblem:

@@ -18,7 +18,8 @@ from ...base.aliases import Numeric, Result, Time
 # Diffrax has no code of its own for this. `breakdown` means nothing else here; an event that writes a value that is not
 # finite ends with `nonlinear_divergence`, too, and its run was made once more with an implicit solver.
 STIFF: Result = diffrax.RESULTS.breakdown
-BOUNDARY = 0.9 * 3.5  # of Tsit5's stability region along the negative real axis is at −3.5
+# Nine tenths of the way to the boundary of Tsit5's stability region, which along the negative real axis is at −3.5.
+BOUNDARY = 0.9 * 3.5
 PATIENCE = 15  # limited steps in a row, as in Hairer's DOPRI5: a transient that passes is not stiffness
 # Steps of that size still to be taken: fewer cost less than compiling another solver
 # (test_default_solver.py::test_fast_decay_before_a_short_end_stays_explicit).
