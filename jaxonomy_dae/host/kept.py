@@ -139,12 +139,12 @@ def key(program: str) -> str | None:
 
 
 def _versions_of_backends() -> str:
-    """Of the driver and the plug-in of a GPU, too."""
+    """The versions of the backends, with those of the driver and the plug-in of a GPU."""
     return "; ".join(sorted({f"{d.platform} {d.client.platform_version}" for d in jax.devices(platform())}))
 
 
 def machine_and_versions() -> dict[str, str]:
-    """What an executable of this process is made for, by what that is."""
+    """What an executable of this process is made for: versions, backend and processor, by name."""
     jaxlib = sys.modules.get("jaxlib")
     return {
         "version of JAX": jax.__version__,

@@ -222,7 +222,7 @@ class Program:
 
 
 def types_of_structs(arrays: Iterable[jax.ShapeDtypeStruct]) -> str:
-    """As `types_of`, of what stands for arrays."""
+    """As `types_of`, for structs that stand for arrays."""
     return repr([(a.shape, a.dtype.name, a.weak_type, str(a.sharding)) for a in arrays])
 
 

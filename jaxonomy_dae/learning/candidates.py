@@ -62,7 +62,7 @@ class Judge:
 
     @classmethod
     def of(cls, fit: "Estimate", left: Leftover) -> "Judge":
-        """That of a fit, as if outliers had not been fitted."""
+        """The judge of a fit, as if outliers had not been fitted."""
         judged = np.zeros(len(left.scores), bool)
         for at in left.by_output.values():
             judged[at] = True

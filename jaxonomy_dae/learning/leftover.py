@@ -87,7 +87,7 @@ class Leftover:
 
     @classmethod
     def of(cls, fit: "Estimate", counts: Iterable[tuple[int, int]]) -> "Leftover":
-        """Those of a fit. `counts`: (experiment, output) of the series whose form is judged."""
+        """What a fit leaves over. `counts`: (experiment, output) of the series whose form is judged."""
         m, o = fit.minimum, fit.objective
         experiment, _, output = o.rows
         share = m.weights.share
@@ -192,7 +192,7 @@ class Leftover:
 
     @functools.cached_property
     def cleaned(self) -> Float[np.ndarray, " m"]:
-        """What would be left over, to first order, of a fit to all samples but outliers; zero at these."""
+        """What a fit to all samples but outliers would leave over, to first order; zero at outliers."""
         far = self.outliers
         if not far.any():
             return self.scores
@@ -209,7 +209,7 @@ class Leftover:
 
     @functools.cached_property
     def _left(self) -> list[Float[np.ndarray, " _"]]:
-        """Of the power of noise at each frequency, the part that a fit leaves."""
+        """The part of the power of noise that a fit leaves, at each frequency."""
         own = self.leverage / self.share[:, None]
         return [np.maximum(1 - periodogram(own[one.at].T).sum(axis=0), 0.0) for one in self.series]
 

@@ -96,7 +96,7 @@ class Linearized:
 
     @classmethod
     def of(cls, objective: Objective, full: Float[np.ndarray, " p"]) -> "Linearized | None":
-        """That of an objective; None where a run fails or nothing moves."""
+        """The linear model of an objective; None where a run fails or nothing moves."""
         plan, s = objective.system.plan, objective.stacked
         if not len(plan.states):
             return None

@@ -78,7 +78,8 @@ def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTa
 
 
 def _known(entries: Entries, n_variables: int) -> tuple[np.ndarray, list[int]]:
-    """For each variable, the equation that determines it alone (−1: none); and equations all of whose are known."""
+    """For each variable, the equation that determines it alone (−1: none); and the equations all of whose variables are
+    known."""
     count = np.bincount(entries.row, minlength=entries.n_rows)
     total = np.bincount(entries.row, np.arange(len(entries.row), dtype=float), entries.n_rows)
     determined_by = np.full(n_variables, -1, np.int64)

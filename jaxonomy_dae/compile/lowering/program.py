@@ -101,7 +101,7 @@ class PlannedLoop:
 
     @property
     def equations(self) -> list[PlannedEquation]:
-        """Those of the first repetition."""
+        """The equations of the first repetition."""
         return [equation for step in self.body for equation in step.equations]
 
 

@@ -43,8 +43,9 @@ def unrounded_sizes(
 
 
 def _between(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
-    """What events assign starts at one of its values, where a branch of an equation may be zero that has a size in all
-    others: free friction says nothing of the force that friction has. Beside it, other branches count."""
+    """The parameters, with those that events assign moved a little. They start at one of their values, at which a
+    branch of an equation may be zero that has a size at all others: while friction is off, its equation says nothing of
+    the force. Beside that value, the other branches count."""
     assigned = model.flat.parameters.changed_by_events
     return np.where(assigned[: len(parameters)], parameters * (1 + MOVED), parameters)
 
@@ -107,7 +108,7 @@ def _lost_beside_others(values: np.ndarray, units: list[str]) -> np.ndarray:
 
 
 class _Balance:
-    """What was found for a model: other values of parameters that its equations do not read change nothing."""
+    """Sizes that were found for a model. They depend on the parameters that its equations read, and on no others."""
 
     def __init__(self, extended: Extended):
         self.factors = Factors()

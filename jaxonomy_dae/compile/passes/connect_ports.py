@@ -283,7 +283,8 @@ def _add_equations(
 def _mixtures(
     nominal: np.ndarray, flow: np.ndarray, sign: np.ndarray, leaves: np.ndarray, enters: np.ndarray, source: Provenances
 ) -> list[EquationGroup]:
-    """What enters each of the ports that meet; all arrays (junctions, ports). One group for each place among them."""
+    """The equations of what enters each of the ports that meet, one group for each place among them; all arrays have
+    shape (junctions, ports)."""
     small = SMALL * np.where(nominal > 0, nominal, 1.0).min(axis=1)
     out = []
     for k in range(flow.shape[1]):

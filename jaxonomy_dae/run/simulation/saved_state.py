@@ -74,7 +74,7 @@ class Memory(eqx.Module):
         return Memory(picked(self.sides, slice(rows)), picked(self.ticked, slice(rows)), self.sizes)
 
     def padded(self, ts: Times, steps: Numeric) -> "Memory":
-        """With the rows beyond the steps taken replaced by the last one."""
+        """The memory with the last row in place of the rows beyond the steps taken."""
         sides, ticked = (padded(ts, rows, steps)[1] for rows in (self.sides, self.ticked))
         return Memory(sides, ticked, self.sizes)
 

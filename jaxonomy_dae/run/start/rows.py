@@ -460,7 +460,8 @@ def _exchanged(generic: _Generic, gradients: Any, chosen: np.ndarray, hard: int)
 
 
 def _weights_of(rank: Any, gradients: Any, n_equations: int) -> np.ndarray:
-    """Of which chosen rows, beside the equations, other rows are combinations, shape (rows, chosen)."""
+    """True where a chosen row has a part in another row, as a combination of chosen rows and equations; shape (rows,
+    chosen)."""
     out = np.zeros((gradients.shape[0], len(rank.r) - n_equations), bool)
     for k in range(gradients.shape[0]):
         weight = np.abs(rank.factors.solve(gradients[[k]].toarray()[0] * rank.c, trans="T"))

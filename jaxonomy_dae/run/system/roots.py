@@ -19,7 +19,7 @@ SURE = 1e-6  # residuals so small, relative to their terms at the start, need no
 
 
 class Beside(NamedTuple):
-    """What a residual counts as zero beside.
+    """The sizes beside which a residual counts as zero.
 
     - `terms`: the magnitude of its terms.
     - `typical`: Σ |∂r/∂s|·size(s) over all that stands in the equation, with typical sizes.

@@ -136,8 +136,8 @@ def _fast_rates(matrix: Any, below: np.ndarray) -> np.ndarray:
 
 
 def _free(matrix: Any, below: np.ndarray) -> np.ndarray:
-    """Of the quantities `below`, as many as the equations leave free: all, or those that the matching of equations to
-    quantities by large entries of their Jacobian passes over (as weights by Duff & Koster 2001)."""
+    """As many of the quantities `below` as the equations leave free: all of them, or those that a matching of equations
+    to quantities by large entries of the Jacobian passes over (weights as by Duff & Koster 2001)."""
     m, n = matrix.shape
     if m == n - len(below):
         return below
