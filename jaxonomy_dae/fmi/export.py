@@ -13,6 +13,7 @@ from ..run.system.system import AcausalSystem
 from .compilers import FOLDERS_OF_FMI_2, TARGETS, compiler_for, shared_library, this_platform
 from .description import model_description
 from .description_2 import model_description_2
+from .manifest import PATH as MANIFEST
 from .model_c import fixed, model_files, table_of_variables
 from .programs import NAMES, check_exportable
 from .variables import Variables
@@ -28,6 +29,7 @@ def export_fmu(
     outputs: Sequence[str] | None = None,
     parameters: Sequence[str] | str = "all",
     fmi: int = 3,
+    dae: bool = False,
     kinds: Sequence[str] | None = None,
     platforms: Sequence[str] | str | None = None,
     stop_time: float = 1.0,
@@ -49,6 +51,9 @@ def export_fmu(
     - `parameters`: the parameters, arrays of parameters and networks that an importer may set. `"all"`: each of them.
         Others keep the values of `system`. Those that only the start reads are `fixed`, others are `tunable`.
     - `fmi`: the version of FMI, 3 or 2. Version 2 has no adjoint derivatives; arrays are scalars there.
+    - `dae`: experimental; adds the equations without the solution of their blocks, for users of the layered standard
+        FMI-LS-DAE (a draft): unknowns `dae.algebraic[1]`, … that they give, `dae.slope[1]`, …, and what equations
+        leave, `dae.residual[1]`, …, hidden constraints included, each with its derivatives and index. FMI 3.
     - `kinds`: `"model_exchange"` is always there. `"co_simulation"` adds a solver, Rodas5P, with error control by the
         importer's tolerance, events, and dense factorizations of up to 300 states. None: it is added if there are no
         more states.
@@ -80,6 +85,8 @@ def export_fmu(
         raise ModelError(f"there is no folder '{target.parent}'")
     if fmi not in (2, 3):
         raise ModelError(f"fmi is the version of FMI, 3 or 2; got {fmi!r}")
+    if dae and fmi != 3:
+        raise ModelError("dae: the layered standard FMI-LS-DAE is one of FMI 3: leave out fmi=2, or dae=True")
     known = TARGETS if fmi == 3 else FOLDERS_OF_FMI_2
     chosen = list(known) if platforms == "all" else [platforms] if isinstance(platforms, str) else platforms
     commands = {}
@@ -89,12 +96,13 @@ def export_fmu(
             commands[name] = command
         elif chosen is not None:
             raise ModelError(f"there is no C compiler for {name} on this machine: install one, or give platforms=()")
-    files, description, identifier = fmu_files(
-        system, target.stem, outputs=outputs, parameters=parameters, fmi=fmi, kinds=kinds, stop_time=stop_time,
-        tolerance=tolerance,
+    files, description, identifier, extra = fmu_files(
+        system, target.stem, outputs=outputs, parameters=parameters, fmi=fmi, dae=dae, kinds=kinds,
+        stop_time=stop_time, tolerance=tolerance,
     )  # fmt: skip
     contents = {"modelDescription.xml": description.encode()}
     contents |= {"sources/buildDescription.xml": _build(identifier)} if fmi == 3 else {}
+    contents |= {name: text.encode() for name, text in extra.items()}
     contents |= {f"sources/{name}": text.encode() for name, text in files.items()}
     for name, command in commands.items():
         ending = TARGETS.get(name, ("", ".so"))[1]
@@ -134,9 +142,10 @@ def _build(identifier: str) -> bytes:
 
 def fmu_files(
     system: AcausalSystem, stem: str, *, outputs: Sequence[str] | None = None, parameters: Sequence[str] | str = "all",
-    fmi: int = 3, kinds: Sequence[str] | None = None, stop_time: float = 1.0, tolerance: float = 1e-6,
-) -> tuple[dict[str, str], str, str]:  # fmt: skip
-    """The C files by name, `modelDescription.xml`, and the identifier of the model."""
+    fmi: int = 3, dae: bool = False, kinds: Sequence[str] | None = None, stop_time: float = 1.0,
+    tolerance: float = 1e-6,
+) -> tuple[dict[str, str], str, str, dict[str, str]]:  # fmt: skip
+    """The C files by name, `modelDescription.xml`, the identifier of the model, and other files by their paths."""
     check_exportable(system)
     system = system.merged().without_stiffness
     if kinds is not None and (unknown := set(kinds) - set(KINDS)):
@@ -151,6 +160,8 @@ def fmu_files(
     names = [name for name in NAMES if name != "step" or co_simulation]
     if fmi == 2:
         names.remove("reverse")
+    if dae:
+        names.append("opened")
     model = Variables(system, outputs, parameters, names, fmi)
     identifier = re.sub(r"\W", "_", stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"m_{identifier}"
@@ -173,4 +184,5 @@ def fmu_files(
     content = description("") + "".join(text for _, text in sorted(files.items()))
     digest = hashlib.sha256(content.encode()).hexdigest()
     token = f"{{{digest[:8]}-{digest[8:12]}-{digest[12:16]}-{digest[16:20]}-{digest[20:32]}}}"
-    return {**files, "token.h": f'#define TOKEN "{token}"\n'}, description(token), identifier
+    extra = {MANIFEST: model.manifest()} if dae else {}
+    return {**files, "token.h": f'#define TOKEN "{token}"\n'}, description(token), identifier, extra

@@ -81,7 +81,7 @@ def _table(declaration: str, entries: Sequence[str]) -> str:
 
 
 # The sizes of a model and the switches of its functions, for `run.c`.
-HAS = ("forward", "reverse", "event", "step")
+HAS = ("forward", "reverse", "event", "step", "opened")
 OF_TEXTS = {"unknowns": "field", "rows": "start", "carried": "event", "events": "event"}  # what has these messages
 
 
@@ -89,6 +89,7 @@ def sizes_of(programs: Programs, layout: Layout, names: dict[str, Sequence[str]]
     """The numbers of `model.h` by name."""
     return {
         "NX": programs.nx, "NZ": programs.nz, "NY": programs.ny, "NG": programs.ng, "NC": programs.nc,
+        "N_UNKNOWNS": programs.n_unknowns,
         "ND": layout.size, "N_ROWS": len(names["rows"]), "N_EVENTS": len(names["events"]), "WORK": work,
         **{f"HAS_{name.upper()}": int(name in programs.names) for name in HAS},
         "LOOKS": LOOKS, "ENDED_AT": 2, "STUCK_AT": 3, "AT_T": layout["t"], "AT_X": layout["x"], "AT_Z": layout["z"],

@@ -1,5 +1,6 @@
 """The variables of an FMU: what an importer sees of a system, and where it stands in the C code."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +14,9 @@ from ..run.system.system import AcausalSystem
 from .content import Content
 from .dependencies import dependencies
 from .description import Structure, Variable, structured, unit_of_rate
+from .manifest import Formulation, manifest
 from .model_c import CVariable
+from .open_blocks import given_quantities, residual_equations
 
 
 class Variables(Content):
@@ -39,7 +42,7 @@ class Variables(Content):
         discrete = set(self.discretes)
         settable = [n for k, n in enumerate(table.names) if k not in table.expressions and n not in discrete]
         if isinstance(parameters, str) and parameters == "all":
-            return settable, list(range(len(self.programs.weights)))
+            return settable, list(range(len(self.programs.networks)))
         if isinstance(parameters, str):
             raise ModelError(f'parameters is a list of names, or "all"; write parameters=[{parameters!r}]')
         names: list[str] = []
@@ -59,7 +62,7 @@ class Variables(Content):
                 table.settable(one)
             names += found
         kept = [
-            k for k, w in enumerate(self.programs.weights) if any(_belongs(w.name, network) for network in networks)
+            k for k, w in enumerate(self.programs.networks) if any(_belongs(w.name, network) for network in networks)
         ]
         return list(dict.fromkeys(names)), kept
 
@@ -79,7 +82,7 @@ class Variables(Content):
         counts = {"t": 1, "x": p.nx, "z": p.nz, "q": p.nq, "p": len(p.p), "u": len(self.plan.inputs.names)}
         given = [columns(name, count) for name, count in counts.items()]
         given += [columns(f"w{k}", w.value.size) for k, w in enumerate(p.weights)]
-        for name in ("field", "outputs", "guards"):
+        for name in ("field", "outputs", "guards", *(["opened"] if p.n_opened else [])):
             parts += dependencies(self._traced[name], given, n)
         return sp.csr_array(sp.vstack(parts, format="csr"))
 
@@ -199,6 +202,24 @@ class Variables(Content):
             self.indicator_places.append(
                 add(Variable(own.name, "local", "continuous", own, initial="calculated", description=told))
             )
+        self.algebraic_places, self.opened_places = [], []
+        if p.n_opened:
+            begin = at[f"w{len(p.networks)}"]
+            for k, (quantity, value) in enumerate(zip(given_quantities(plan), p.weights[-1].value, strict=True)):
+                own = c(f"dae.algebraic[{k + 1}]", "STORED", "ALWAYS", begin + k, known=True)
+                told = f"{plan.quantity_name[quantity]}, as users of FMI-LS-DAE give it"
+                start = np.array(float(value))
+                variable = Variable(own.name, "local", "continuous", own, "approx", start, description=told)
+                self.algebraic_places.append(add(variable, begin + k))
+            for k, name in enumerate(self.opened_names):
+                own = c(name, "UNKNOWN", "NEVER", p.nx + p.ny + p.ng + k)
+                variable = Variable(own.name, "local", "continuous", own, initial="calculated")
+                if k < p.nx:
+                    variable = dataclasses.replace(variable, derivative=self.state_places[k])
+                else:
+                    told = f"What is left of {plan.describe(int(residual_equations(plan)[k - p.nx]))}"
+                    variable = dataclasses.replace(variable, description=told)
+                self.opened_places.append(add(variable))
         self.place_of_column = columns
         return out
 
@@ -227,6 +248,22 @@ class Variables(Content):
     def needs_steps(self) -> bool:
         """Whether integrators must tell of completed steps."""
         return bool(self.plan.n_projected or self.programs.nz or self.programs.ng or self.programs.nc)
+
+    def manifest(self) -> str:
+        """The manifest of FMI-LS-DAE: residuals of one equation and of its derivatives stand together."""
+        p, extended = self.programs, self.plan.extended
+        first = p.nx + p.ny + p.ng
+        slopes = {place: self._places(first + k) for k, place in enumerate(self.opened_places[: p.nx])}
+        groups: dict[int, list[Formulation]] = {}
+        highest = np.zeros(int(extended.base.max(initial=0)) + 1, int)
+        np.maximum.at(highest, extended.base, extended.level)
+        for k, equation in enumerate(residual_equations(self.plan)):
+            base, level = int(extended.base[equation]), int(extended.level[equation])
+            own = self._places(first + p.nx + k)
+            found = Formulation(self.opened_places[p.nx + k], int(highest[base]) - level + 1, own)
+            groups.setdefault(base, []).append(found)
+        ordered = [sorted(group, key=lambda f: -f.index) for group in groups.values()]
+        return manifest(self.algebraic_places, slopes, ordered)
 
     def structure(self) -> Structure:
         nx, ny = self.programs.nx, self.programs.ny

@@ -74,6 +74,9 @@ static void ensure_unknowns(Model *m) {
   p_field_of(m->s.d, m->unknowns, w);
   p_outputs_of(m->s.d, m->unknowns + NX, w);
   p_guards_of(m->s.d, m->unknowns + NX + NY, w);
+#if HAS_OPENED
+  p_opened_of(m->s.d, m->unknowns + NX + NY + NG, w);
+#endif
   m->valid = 1;
 }
 
@@ -336,7 +339,7 @@ static int get_indicators(Model *m, double z[], size_t n) {
   if (n != NG) return say(m, "The number of event indicators is another one.", "", "");
   if (!m->valid) p_guards_of(m->s.d, m->unknowns + NX + NY, work_of(m));
   for (int k = 0; k < NG; ++k) z[k] = indicator(m, k);
-  return logged(m, check_unknowns(m, NX + NY, N_UNKNOWNS));
+  return logged(m, check_unknowns(m, NX + NY, NX + NY + NG));
 }
 
 static int completed(Model *m, const char *function, int *enter_event_mode) {

@@ -565,6 +565,7 @@ class AcausalSystem(eqx.Module):
         outputs: Sequence[str] | None = None,
         parameters: Sequence[str] | str = "all",
         fmi: int = 3,
+        dae: bool = False,
         kinds: Sequence[str] | None = None,
         platforms: Sequence[str] | str | None = None,
         stop_time: float = 1.0,
@@ -576,7 +577,7 @@ class AcausalSystem(eqx.Module):
         from ...fmi.export import export_fmu
 
         return export_fmu(
-            self, path, outputs=outputs, parameters=parameters, fmi=fmi, kinds=kinds, platforms=platforms,
+            self, path, outputs=outputs, parameters=parameters, fmi=fmi, dae=dae, kinds=kinds, platforms=platforms,
             stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
         )  # fmt: skip
 
