@@ -32,6 +32,14 @@ def as_arrays(variables: Sequence[Variable]) -> tuple[list[Variable], np.ndarray
     return out, new
 
 
+def entries_together(names: Sequence[str]) -> list[str]:
+    """Names in their order, but the entries of an array where its first one stands."""
+    first: dict[str, int] = {}
+    for name in names:
+        first.setdefault(_entry(name)[0], len(first))
+    return sorted(names, key=lambda name: first[_entry(name)[0]])
+
+
 def _entry(name: str) -> tuple[str, tuple[int, ...]]:
     """The name of an array, and the indices of its entry."""
     indices = tuple(int(k) for found in _INDEX.findall(name) for k in found.split(","))
@@ -45,10 +53,11 @@ def _run(variables: Sequence[Variable], begin: int, new: np.ndarray) -> tuple[in
     if not index or any(index) or first.c.size != 1 or first.name.startswith("'"):
         return begin + 1, ()
     indices = [index]
+    step = variables[begin + 1].c.place - first.c.place if begin + 1 < len(variables) else 1
     while begin + len(indices) < len(variables):
         other = variables[begin + len(indices)]
         other_name, index = _entry(other.name)
-        if other_name != name or not _alike(first, other, len(indices), new):
+        if other_name != name or not _alike(first, other, len(indices) * step, new):
             break
         indices.append(index)
     shape = tuple(max(column) + 1 for column in zip(*indices, strict=True))
@@ -57,7 +66,7 @@ def _run(variables: Sequence[Variable], begin: int, new: np.ndarray) -> tuple[in
 
 
 def _alike(first: Variable, other: Variable, distance: int, new: np.ndarray) -> bool:
-    """True for variables that differ in their places, by `distance`, and in their starts."""
+    """True for variables that differ in their places, by `distance`, in their starts, and in typical sizes."""
     c = dataclasses.replace(
         first.c, name=other.c.name, place=first.c.place + distance,
         start=first.c.start if first.c.start < 0 else first.c.start + distance,
@@ -69,12 +78,17 @@ def _alike(first: Variable, other: Variable, distance: int, new: np.ndarray) -> 
     if first.derivative is not None and new[first.derivative] != new[other.derivative]:
         return False
     own = dataclasses.replace(first, c=other.c, name=other.name, start=other.start, derivative=other.derivative)
+    own = dataclasses.replace(own, nominal=other.nominal)
     return all(getattr(own, f.name) is getattr(other, f.name) or getattr(own, f.name) == getattr(other, f.name)
                for f in dataclasses.fields(own))  # fmt: skip
 
 
 def _array(first: Variable, entries: Sequence[Variable], shape: tuple[int, ...]) -> Variable:
     name, _ = _entry(first.name)
-    starts = None if first.start is None else np.reshape([float(v.start) for v in entries if v.start is not None], shape)
-    c = dataclasses.replace(first.c, name=name, size=len(entries))
-    return dataclasses.replace(first, name=name, c=c, start=starts, shape=shape)
+    starts = (
+        None if first.start is None else np.reshape([float(v.start) for v in entries if v.start is not None], shape)
+    )
+    step = entries[1].c.place - entries[0].c.place
+    c = dataclasses.replace(first.c, name=name, size=len(entries), step=step)
+    nominal = max(v.nominal for v in entries)
+    return dataclasses.replace(first, name=name, c=c, start=starts, nominal=nominal, shape=shape)

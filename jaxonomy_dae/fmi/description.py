@@ -36,6 +36,7 @@ class Variable:
     nominal: float = 0.0
     derivative: int | None = None
     reinit: bool = False
+    shape: tuple[int, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,8 +174,7 @@ def of_number(v: Variable, first: int) -> list[str]:
 
 
 def _variable(place: int, v: Variable) -> list[str]:
-    shape = () if v.start is None else np.shape(v.start)
     head = f"    <Float64 {' '.join([*of_variable(place, v), *of_number(v, 0)])}"
-    if not shape:
+    if not v.shape:
         return [f"{head}/>"]
-    return [f"{head}>" + "".join(f'<Dimension start="{n}"/>' for n in shape) + "</Float64>"]
+    return [f"{head}>" + "".join(f'<Dimension start="{n}"/>' for n in v.shape) + "</Float64>"]

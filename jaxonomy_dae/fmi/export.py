@@ -29,6 +29,7 @@ def export_fmu(
     outputs: Sequence[str] | None = None,
     parameters: Sequence[str] | str = "all",
     fmi: int = 3,
+    arrays: bool = False,
     dae: bool = False,
     kinds: Sequence[str] | None = None,
     platforms: Sequence[str] | str | None = None,
@@ -51,6 +52,8 @@ def export_fmu(
     - `parameters`: the parameters, arrays of parameters and networks that an importer may set. `"all"`: each of them.
         Others keep the values of `system`. Those that only the start reads are `fixed`, others are `tunable`.
     - `fmi`: the version of FMI, 3 or 2. Version 2 has no adjoint derivatives; arrays are scalars there.
+    - `arrays`: whether variables of arrays of components are arrays of FMI 3, `cell.c.v`, as in solutions, where they
+        stand together; otherwise each entry, `cell[0].c.v`, is a scalar. Dependencies are those of whole arrays then.
     - `dae`: experimental; adds the equations without the solution of their blocks, for users of the layered standard
         FMI-LS-DAE (a draft): unknowns `dae.algebraic[1]`, … that they give, `dae.slope[1]`, …, and what equations
         leave, `dae.residual[1]`, …, hidden constraints included, each with its derivatives and index. FMI 3.
@@ -85,6 +88,8 @@ def export_fmu(
         raise ModelError(f"there is no folder '{target.parent}'")
     if fmi not in (2, 3):
         raise ModelError(f"fmi is the version of FMI, 3 or 2; got {fmi!r}")
+    if arrays and fmi != 3:
+        raise ModelError("arrays: FMI 2 has none: leave out fmi=2, or arrays=True")
     if dae and fmi != 3:
         raise ModelError("dae: the layered standard FMI-LS-DAE is one of FMI 3: leave out fmi=2, or dae=True")
     known = TARGETS if fmi == 3 else FOLDERS_OF_FMI_2
@@ -97,7 +102,7 @@ def export_fmu(
         elif chosen is not None:
             raise ModelError(f"there is no C compiler for {name} on this machine: install one, or give platforms=()")
     files, description, identifier, extra = fmu_files(
-        system, target.stem, outputs=outputs, parameters=parameters, fmi=fmi, dae=dae, kinds=kinds,
+        system, target.stem, outputs=outputs, parameters=parameters, fmi=fmi, arrays=arrays, dae=dae, kinds=kinds,
         stop_time=stop_time, tolerance=tolerance,
     )  # fmt: skip
     contents = {"modelDescription.xml": description.encode()}
@@ -142,7 +147,7 @@ def _build(identifier: str) -> bytes:
 
 def fmu_files(
     system: AcausalSystem, stem: str, *, outputs: Sequence[str] | None = None, parameters: Sequence[str] | str = "all",
-    fmi: int = 3, dae: bool = False, kinds: Sequence[str] | None = None, stop_time: float = 1.0,
+    fmi: int = 3, arrays: bool = False, dae: bool = False, kinds: Sequence[str] | None = None, stop_time: float = 1.0,
     tolerance: float = 1e-6,
 ) -> tuple[dict[str, str], str, str, dict[str, str]]:  # fmt: skip
     """The C files by name, `modelDescription.xml`, the identifier of the model, and other files by their paths."""
@@ -162,7 +167,7 @@ def fmu_files(
         names.remove("reverse")
     if dae:
         names.append("opened")
-    model = Variables(system, outputs, parameters, names, fmi)
+    model = Variables(system, outputs, parameters, names, fmi, arrays)
     identifier = re.sub(r"\W", "_", stem, flags=re.ASCII)
     identifier = identifier if identifier[:1].isalpha() else f"m_{identifier}"
 

@@ -59,6 +59,7 @@ class CVariable:
     settable: str
     place: int
     size: int
+    step: int
     start: int
     known: bool
     low: float
@@ -146,8 +147,8 @@ def fixed(name: str) -> str:
 def table_of_variables(variables: Sequence[CVariable]) -> str:
     """`variables.c`: what an importer sees."""
     rows = [
-        f"{{{v.kind}, {v.settable}, {v.place}, {v.size}, {v.start}, {int(v.known)}, {number(v.low, np.float64)}, "
-        f"{number(v.high, np.float64)}, {text(v.name)}}}"
+        f"{{{v.kind}, {v.settable}, {v.place}, {v.size}, {v.step}, {v.start}, {int(v.known)}, "
+        f"{number(v.low, np.float64)}, {number(v.high, np.float64)}, {text(v.name)}}}"
         for v in variables
     ]
     return f"#define N_VARIABLES {len(variables)}\n\n" + _table("Variable VARIABLES", rows)

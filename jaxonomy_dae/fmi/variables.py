@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from ..base.errors import ModelError, nearest
 from ..compile.model.array_names import inner_name
 from ..run.system.system import AcausalSystem
+from .arrays import as_arrays, entries_together
 from .content import Content
 from .dependencies import dependencies
 from .description import Structure, Variable, structured, unit_of_rate
@@ -25,14 +26,22 @@ class Variables(Content):
 
     def __init__(
         self, system: AcausalSystem, outputs: Sequence[str] | None, parameters: Sequence[str] | str,
-        functions: Sequence[str], version: int = 3,
+        functions: Sequence[str], version: int = 3, arrays: bool = False,
     ):  # fmt: skip
+        self._arrays = arrays
         super().__init__(system, outputs, functions)
         self._version = version
         self.parameter_names, self.weights = self._parameters(parameters)
+        if arrays:
+            self.parameter_names = entries_together(self.parameter_names)
         self._traced = self.programs.traced
         self._depend = self._dependencies()
-        self.variables = self._variables(self.wanted)
+        every = self._variables(self.wanted)
+        self.variables, self._new = as_arrays(every) if arrays else (every, np.arange(len(every)))
+
+    def _outputs(self, outputs: Sequence[str] | None) -> list[str]:
+        names = super()._outputs(outputs)
+        return entries_together(names) if self._arrays else names
 
     # --- names ------------------------------------------------------------------------------------------------------
 
@@ -90,7 +99,7 @@ class Variables(Content):
         """The places of the variables that an unknown depends on."""
         row = self._depend[[unknown]]
         found = self.place_of_column[row.indices[row.data.astype(bool)]]
-        return sorted({int(k) for k in found if k >= 0})
+        return sorted({int(self._new[k]) for k in found if k >= 0})
 
     @property
     def _tunable(self) -> np.ndarray:
@@ -125,7 +134,7 @@ class Variables(Content):
             return len(out) - 1
 
         def c(name: str, kind: str, settable: str, place: int, **more: Any) -> CVariable:
-            given = {"size": 1, "start": -1, "known": False, "low": -math.inf, "high": math.inf} | more
+            given = {"size": 1, "step": 1, "start": -1, "known": False, "low": -math.inf, "high": math.inf} | more
             return CVariable(kind=kind, settable=settable, place=place, name=name, **given)
 
         add(
@@ -187,7 +196,7 @@ class Variables(Content):
         for k in self.weights:
             for name, value, place in self._arrays(p.weights[k].name, p.weights[k].value, at[f"w{k}"]):
                 own = c(structured(name), "STORED", "ALWAYS", place, known=True, size=value.size)
-                add(Variable(own.name, "parameter", "tunable", own, "exact", value), place)
+                add(Variable(own.name, "parameter", "tunable", own, "exact", value, shape=value.shape), place)
         self.guard_places, self.indicator_places = [], []
         names = () if plan.events is None else plan.events.names[plan.events.n_clocks :]
         for k, text in enumerate(names):
@@ -252,40 +261,43 @@ class Variables(Content):
     def manifest(self) -> str:
         """The manifest of FMI-LS-DAE: residuals of one equation and of its derivatives stand together."""
         p, extended = self.programs, self.plan.extended
-        first = p.nx + p.ny + p.ng
-        slopes = {place: self._places(first + k) for k, place in enumerate(self.opened_places[: p.nx])}
+        first, opened = p.nx + p.ny + p.ng, [int(self._new[place]) for place in self.opened_places]
+        slopes = {place: self._places(first + k) for k, place in enumerate(opened[: p.nx])}
         groups: dict[int, list[Formulation]] = {}
         highest = np.zeros(int(extended.base.max(initial=0)) + 1, int)
         np.maximum.at(highest, extended.base, extended.level)
         for k, equation in enumerate(residual_equations(self.plan)):
             base, level = int(extended.base[equation]), int(extended.level[equation])
             own = self._places(first + p.nx + k)
-            found = Formulation(self.opened_places[p.nx + k], int(highest[base]) - level + 1, own)
+            found = Formulation(opened[p.nx + k], int(highest[base]) - level + 1, own)
             groups.setdefault(base, []).append(found)
         ordered = [sorted(group, key=lambda f: -f.index) for group in groups.values()]
-        return manifest(self.algebraic_places, slopes, ordered)
+        return manifest([int(self._new[place]) for place in self.algebraic_places], slopes, ordered)
 
     def structure(self) -> Structure:
         nx, ny = self.programs.nx, self.programs.ny
         names = set(self.output_states)
-        outputs: dict[int, Sequence[int] | None] = {
-            place: [place] for place, name in zip(self.state_places, self.system.states, strict=True) if name in names
-        }
-        outputs |= {place: self._places(nx + k) for k, place in enumerate(self.output_places)}
-        outputs |= {place: None for place, is_output in self.discrete_places if is_output}
-        outputs |= {place: self._places(nx + ny + k) for k, place in enumerate(self.guard_places)}
-        derivatives: dict[int, Sequence[int] | None] = {
-            place: self._places(k) for k, place in enumerate(self.slope_places)
-        }
-        indicators: dict[int, Sequence[int] | None] = {
-            place: self._places(nx + ny + k) for k, place in enumerate(self.indicator_places)
-        }
-        moving = {*self.state_places, *self.slope_places}
+
+        def of(places: Sequence[int], begin: int) -> dict[int, Sequence[int] | None]:
+            """What variables depend on that are the unknowns from `begin` on; an array on what its entries do."""
+            found: dict[int, set[int]] = {}
+            for k, place in enumerate(places):
+                found.setdefault(int(self._new[place]), set()).update(self._places(begin + k))
+            return {place: sorted(own) for place, own in found.items()}
+
+        own = [
+            int(self._new[s]) for s, name in zip(self.state_places, self.system.states, strict=True) if name in names
+        ]
+        outputs: dict[int, Sequence[int] | None] = {place: [place] for place in own}
+        outputs |= of(self.output_places, nx)
+        outputs |= {int(self._new[place]): None for place, is_output in self.discrete_places if is_output}
+        outputs |= of(self.guard_places, nx + ny)
+        moving = {int(self._new[place]) for place in (*self.state_places, *self.slope_places)}
         calculated = [
             k for k, v in enumerate(self.variables)
             if v.initial == "calculated" and (v.causality == "output" or k in moving)
         ]  # fmt: skip
-        return Structure(outputs, derivatives, indicators, calculated)
+        return Structure(outputs, of(self.slope_places, 0), of(self.indicator_places, nx + ny), calculated)
 
 
 def _belongs(weight: str, network: str) -> bool:

@@ -194,6 +194,8 @@ def test_what_cannot_be_exported_is_refused_by_name(tmp_path, ball):
         export_fmu(system, tmp_path / "x.fmu", platforms="amiga")
     with pytest.raises(ModelError, match="fmi is the version of FMI, 3 or 2; got 1"):
         export_fmu(system, tmp_path / "x.fmu", fmi=1)
+    with pytest.raises(ModelError, match="arrays: FMI 2 has none"):
+        export_fmu(system, tmp_path / "x.fmu", fmi=2, arrays=True)
     with pytest.raises(ModelError, match="kinds: 'simulink' is not known"):
         export_fmu(system, tmp_path / "x.fmu", kinds=["simulink"])
 
@@ -343,11 +345,11 @@ def test_what_version_2_does_with_states_and_the_end_of_a_run(tmp_path):
 
 @pytest.mark.slow
 def test_instances_in_threads_do_not_see_each_other(ball):
-    """Each of 40 balls is dropped from a height of its own, and bounces 250 times at one place."""
+    """Each of 100 balls is dropped from a height of its own, and bounces 100 times at one place."""
 
     def bounced(fmu, k):
         speeds = []
-        for j in range(250):
+        for j in range(100):
             fmu.model.enterContinuousTimeMode()
             fmu.model.setTime(0.01 * (j + 1))
             fmu.model.setContinuousStates(np.array([-1e-12, -1.0 - k]).ctypes.data_as(model_pointer()), 2)
@@ -359,14 +361,14 @@ def test_instances_in_threads_do_not_see_each_other(ball):
 
     found: dict[int, np.ndarray] = {}
     with contextlib.ExitStack() as stack:
-        instances = [stack.enter_context(opened(ball, {"b.h0": 1.0 + k / 100, "b.e": 0.5})) for k in range(40)]
-        threads = [threading.Thread(target=lambda k=k: found.update({k: bounced(instances[k], k)})) for k in range(40)]
+        instances = [stack.enter_context(opened(ball, {"b.h0": 1.0 + k / 100, "b.e": 0.5})) for k in range(100)]
+        threads = [threading.Thread(target=lambda k=k: found.update({k: bounced(instances[k], k)})) for k in range(100)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-        assert [fmu.get("b.n")[0] for fmu in instances] == [250.0] * 40
-    for k in range(40):
+        assert [fmu.get("b.n")[0] for fmu in instances] == [100.0] * 100
+    for k in range(100):
         np.testing.assert_allclose(found[k], 0.5 * (1.0 + k), rtol=1e-9)
 
 
@@ -389,6 +391,31 @@ def test_sanitizers_find_nothing(tmp_path, kind, least):
     done = subprocess.run(["./drive", "20000", "1e-3"], cwd=tmp_path, capture_output=True, text=True)
     assert not done.returncode, done.stdout + done.stderr
     assert int(done.stdout.split()[-1]) >= least
+
+
+@pytest.mark.slow
+def test_arrays_of_components_are_arrays(tmp_path):
+    """Runs and derivatives are those of scalars; what an entry depends on, the array does."""
+    system = ladder(4, in_array=True)
+    scalars, path = exported(system, tmp_path, "scalars"), exported(system, tmp_path, "arrays", arrays=True)
+    names = [f"cell[{k}].c.v" for k in range(4)]
+    for kind in "ModelExchange", "CoSimulation":
+        expected, found = run(scalars, 1.0, names, fmi_type=kind), run(path, 1.0, ["cell.c.v"], fmi_type=kind)
+        assert found["cell.c.v"].shape[1:] == (4,)
+        for k, name in enumerate(names):
+            np.testing.assert_allclose(found["cell.c.v"][:, k], expected[name], rtol=1e-12, atol=1e-12)
+    rng = np.random.default_rng(0)
+    with opened(scalars) as one, opened(path) as other:
+        slopes, along = [f"der({name})" for name in names], rng.normal(size=8)
+        knowns = [*names, *(f"cell[{k}].c.C" for k in range(4))]
+        forward = other.model.getDirectionalDerivative(
+            other.references(["der(cell.c.v)"]), other.references(["cell.c.v", "cell.c.C"]), list(along), 4
+        )
+        np.testing.assert_allclose(forward, one.forward(slopes, knowns, along), rtol=1e-12, atol=1e-12)
+        reverse = other.reverse(["der(cell.c.v)"], ["cell.c.v", "cell.c.C"], along[:4], 8)
+        np.testing.assert_allclose(reverse, one.reverse(slopes, knowns, along[:4], 8), rtol=1e-12, atol=1e-12)
+        derivatives = {u.variable.name: {v.name for v in u.dependencies} for u in other.description.derivatives}
+        assert {"cell.c.v", "cell.r.R", "cell.c.C"} <= derivatives["der(cell.c.v)"]
 
 
 @pytest.mark.slow

@@ -33,6 +33,7 @@ typedef struct {
   Settable settable;
   int place;     /* in `d`, among the unknowns, or among the indicators */
   int size;
+  int step;      /* between the places of its entries */
   int start;     /* of a state with a start of its own: its place in `d`, else -1 */
   int known;     /* whether derivatives by it exist */
   double low, high;
@@ -142,9 +143,9 @@ static int get_values(Model *m, const Reference r[], size_t n, double values[], 
     }
     if (v->kind != STORED) ensure_unknowns(m);
     for (int q = 0; q < v->size; ++q)
-      values[k++] = v->kind == STORED      ? m->s.d[place + q]
-                    : v->kind == UNKNOWN   ? m->unknowns[place + q]
-                                           : indicator(m, place + q);
+      values[k++] = v->kind == STORED      ? m->s.d[place + q * v->step]
+                    : v->kind == UNKNOWN   ? m->unknowns[place + q * v->step]
+                                           : indicator(m, place + q * v->step);
   }
   return k == n_values ? ALL_WELL : say(m, "The number of values is not that of the variables.", "", "");
 }
@@ -164,7 +165,7 @@ static int set_values(Model *m, const Reference r[], size_t n, const double valu
       if (!is_number(value)) return say(m, "The value given for ", v->name, " is not a finite number.");
       if (value < v->low || value > v->high)
         return say(m, "The value given for ", v->name, " is out of its bounds.");
-      m->s.d[place + q] = value;
+      m->s.d[place + q * v->step] = value;
     }
   }
   m->valid = 0;
@@ -245,7 +246,7 @@ static int forward(
     const Variable *v = known(m, knowns[j]);
     if (!v) return ERROR_FOUND;
     if (k + (size_t)v->size > n_seed) return say(m, "The number of seeds is not that of the knowns.", "", "");
-    for (int q = 0; q < v->size; ++q) m->along[v->place + q] += seed[k++];
+    for (int q = 0; q < v->size; ++q) m->along[v->place + q * v->step] += seed[k++];
   }
   if (k != n_seed) return say(m, "The number of seeds is not that of the knowns.", "", "");
   p_forward_of(m->s.d, m->along, m->weight, work_of(m));
@@ -255,7 +256,7 @@ static int forward(
     if (!v) return ERROR_FOUND;
     if (k + (size_t)v->size > n_out) return say(m, "The number of sensitivities is not that of the unknowns.", "", "");
     for (int q = 0; q < v->size; ++q)
-      out[k++] = v->kind == UNKNOWN ? m->weight[v->place + q] : m->along[v->place + q];
+      out[k++] = v->kind == UNKNOWN ? m->weight[v->place + q * v->step] : m->along[v->place + q * v->step];
   }
   return k == n_out ? ALL_WELL : say(m, "The number of sensitivities is not that of the unknowns.", "", "");
 }
@@ -274,7 +275,10 @@ static int reverse(
     const Variable *v = unknown(m, unknowns[j]);
     if (!v) return ERROR_FOUND;
     if (k + (size_t)v->size > n_seed) return say(m, "The number of seeds is not that of the unknowns.", "", "");
-    for (int q = 0; q < v->size; ++q) *(v->kind == UNKNOWN ? &m->weight[v->place + q] : &m->next[v->place + q]) += seed[k++];
+    for (int q = 0; q < v->size; ++q) {
+      const int place = v->place + q * v->step;
+      *(v->kind == UNKNOWN ? &m->weight[place] : &m->next[place]) += seed[k++];
+    }
   }
   if (k != n_seed) return say(m, "The number of seeds is not that of the unknowns.", "", "");
   p_reverse_of(m->s.d, m->weight, m->along, work_of(m));
@@ -284,7 +288,8 @@ static int reverse(
     if (!v) return ERROR_FOUND;
     if (k + (size_t)v->size > n_out) return say(m, "The number of sensitivities is not that of the knowns.", "", "");
     for (int q = 0; q < v->size; ++q) {
-      out[k++] = m->along[v->place + q] + m->next[v->place + q];
+      const int place = v->place + q * v->step;
+      out[k++] = m->along[place] + m->next[place];
     }
   }
   return k == n_out ? ALL_WELL : say(m, "The number of sensitivities is not that of the knowns.", "", "");

@@ -565,6 +565,7 @@ class AcausalSystem(eqx.Module):
         outputs: Sequence[str] | None = None,
         parameters: Sequence[str] | str = "all",
         fmi: int = 3,
+        arrays: bool = False,
         dae: bool = False,
         kinds: Sequence[str] | None = None,
         platforms: Sequence[str] | str | None = None,
@@ -577,8 +578,8 @@ class AcausalSystem(eqx.Module):
         from ...fmi.export import export_fmu
 
         return export_fmu(
-            self, path, outputs=outputs, parameters=parameters, fmi=fmi, dae=dae, kinds=kinds, platforms=platforms,
-            stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
+            self, path, outputs=outputs, parameters=parameters, fmi=fmi, arrays=arrays, dae=dae, kinds=kinds,
+            platforms=platforms, stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
         )  # fmt: skip
 
     def to_c(
