@@ -194,7 +194,7 @@ class Variables(Content):
             start = np.array(float(p.p[k]))
             add(Variable(own.name, "parameter", variability, own, "exact", start, table.units[k]), place)
         for k in self.weights:
-            for name, value, place in self._arrays(p.weights[k].name, p.weights[k].value, at[f"w{k}"]):
+            for name, value, place in self._settable_parts(p.weights[k].name, p.weights[k].value, at[f"w{k}"]):
                 own = c(structured(name), "STORED", "ALWAYS", place, known=True, size=value.size)
                 add(Variable(own.name, "parameter", "tunable", own, "exact", value, shape=value.shape), place)
         self.guard_places, self.indicator_places = [], []
@@ -232,7 +232,7 @@ class Variables(Content):
         self.place_of_column = columns
         return out
 
-    def _arrays(self, name: str, value: np.ndarray, place: int) -> list[tuple[str, np.ndarray, int]]:
+    def _settable_parts(self, name: str, value: np.ndarray, place: int) -> list[tuple[str, np.ndarray, int]]:
         """The variables that make up an array: (name, value, place). One, or one for each of its entries."""
         if self._version == 3 or not value.shape:
             return [(name, value, place)] if value.size else []
