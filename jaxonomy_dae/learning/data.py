@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
-from ..base.errors import ModelError, nearest
+from ..base.errors import ModelError, explained_keywords, nearest
 from ..compile.lowering.plan import SystemPlan
 from ..run.system.inputs import KINDS
 from .axes import LEGEND, AxesGiven, chosen_names, grid_of_axes
@@ -23,6 +23,7 @@ class Data:
     They may differ in length, sampling and measured variables. All of them must name the same inputs and starts.
     """
 
+    @explained_keywords()
     def __init__(self, *experiments: Experiment):
         for k, one in enumerate(experiments):
             if not isinstance(one, Experiment):

@@ -38,6 +38,7 @@ SURE = 499  # draws after which a third of the level counts as below it: the lev
 BATCH = 50  # draws at once: most right models are known by the first
 ROOM = 2e7  # numbers at once: 160 MB
 BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
+LEAST = 0.5  # of a degree of freedom: what is less is rounding, or a trace of priors
 FEWEST = 4  # samples of a series, below which there is nothing to correlate
 SHORTEST = 8  # frequencies of a record below which its lowest ones are those that a fit takes away
 FINE = 2  # frequencies for each that is independent: a peak between two of these loses up to three fifths of its power
@@ -90,9 +91,11 @@ class Leftover:
         experiment, _, output = o.rows
         share = m.weights.share
         leverage = m.weights.informing[:, None] * m.found.jacobian @ fit.root[o.free]
-        known = o.evidence.noise < 0 if not o.has_variances else np.zeros(len(share), bool)
+        # Samples that are all used up by numbers of the model leave rounding, of which nothing is to be said.
+        has_left = fit.freedom > LEAST
+        known = (o.evidence.noise < 0) & (has_left and not o.has_variances)
         count = float(np.sum(share[known] ** 2))
-        chosen = [Series(k, j, np.flatnonzero((experiment == k) & (output == j))) for k, j in counts]
+        chosen = [Series(k, j, np.flatnonzero((experiment == k) & (output == j))) for k, j in counts if has_left]
         series = tuple(one for one in chosen if len(one.at) >= FEWEST)
         found = []
         for j in dict.fromkeys(one.output for one in series):
