@@ -55,29 +55,49 @@ def _powers_of_two(values: np.ndarray) -> np.ndarray:
     return np.sign(values) * np.exp2(exponents)
 
 
+class _Declared:
+    """What a model declares of sizes, whatever the values of its parameters."""
+
+    def __init__(self, model: ReducedModel):
+        self.flat, variables = model.flat, model.variables
+        flat = self.flat
+        self.scale = declared_scale(model)  # of quantities
+        self.started = np.flatnonzero(flat.variables.start.is_given & (variables.quantity >= 0))
+        self.quantity, self.factor = variables.quantity[self.started], variables.factor[self.started]
+        self.open = self.scale[self.quantity] == 0.0
+        self.unit = [flat.variables.unit[k] for k in self.started.tolist()]
+        # Numbers that nothing computes are not told from rounding, so their slopes need not be known.
+        self.are_numbers = bool(flat.variables.start.is_number[self.started].all())
+
+
+_DECLARED: weakref.WeakKeyDictionary[Extended, _Declared] = weakref.WeakKeyDictionary()
+
+
 def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
     """Nominal values, and else the largest starts; zero where there is none."""
-    size, starts = declared_scale(model), model.flat.variables.start
-    v = np.flatnonzero(starts.is_given & (model.variables.quantity >= 0))
-    values = starts.values(parameters)
-    # A start that is computed may be rounding alone, as L·sin(π) is; a number that is given is what it is.
-    moved = starts.values(parameters * (1 + MOVED * generic(np.random.default_rng(1), parameters.shape)))
-    values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
-    quantity, value = model.variables.quantity[v], values[v] / model.variables.factor[v]
-    tells = np.isfinite(value) & (value != 0.0) & (size[quantity] == 0.0)
-    tells &= ~_lost_beside_others(values[v], model.flat.variables.unit, v)
-    np.maximum.at(size, quantity[tells], np.abs(value[tells]))
+    declared = _DECLARED.get(model.extended)
+    if declared is None or declared.flat is not model.flat:
+        declared = _DECLARED[model.extended] = _Declared(model)
+    size, starts, started = declared.scale.copy(), model.flat.variables.start, declared.started
+    values = starts.values(parameters)[started]
+    if not declared.are_numbers:
+        # A start that is computed may be rounding alone, as L·sin(π) is; a number that is given is what it is.
+        moved = starts.values(parameters * (1 + MOVED * generic(np.random.default_rng(1), parameters.shape)))[started]
+        values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
+    value = values / declared.factor
+    tells = declared.open & np.isfinite(value) & (value != 0.0) & ~_lost_beside_others(values, declared.unit)
+    np.maximum.at(size, declared.quantity[tells], np.abs(value[tells]))
     return size
 
 
-def _lost_beside_others(values: np.ndarray, units: list[str], variables: np.ndarray) -> np.ndarray:
+def _lost_beside_others(values: np.ndarray, units: list[str]) -> np.ndarray:
     """True for starts that rounding would lose beside the largest one of the same unit: an angle of 1e-16 among angles
     of 1, computed outside of the model, is zero."""
     sizes = np.where(np.isfinite(values), np.abs(values), 0.0)
     small = (sizes > 0) & (sizes <= KNOWN * sizes.max(initial=0.0))
-    lost = np.zeros(len(variables), bool)
-    for unit in {units[k] for k in variables[small].tolist()} - {""}:
-        same = np.array([units[k] == unit for k in variables.tolist()])
+    lost = np.zeros(len(values), bool)
+    for unit in {units[k] for k in np.flatnonzero(small).tolist()} - {""}:
+        same = np.array([other == unit for other in units])
         lost |= same & (sizes <= KNOWN * sizes[same].max())
     return lost
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import sympy
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 from ...base.errors import ModelError
 from ...write.declarations import EachValue, Variable

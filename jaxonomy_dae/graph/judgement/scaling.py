@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 PASSES = 10  # each halves, in logarithms, how far the largest entries are from one (Ruiz 2001): a thousandth is left
 LARGEST_EXPONENT = 300.0  # of ten, for a scale

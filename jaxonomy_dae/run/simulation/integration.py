@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ...base.aliases import Args, Controller, Inputs, PyTree, Result, Solver, State, Terms, Time, Times
@@ -84,7 +85,7 @@ class Outcome(eqx.Module):
 
     def numbers(self) -> dict[str, PyTree]:
         """The counts as Python integers."""
-        return {name: int(value) for name, value in self.stats.items() if jnp.ndim(value) == 0}
+        return {name: int(value) for name, value in jax.device_get(self.stats).items() if np.ndim(value) == 0}
 
 
 class _Start(NamedTuple):

@@ -285,7 +285,9 @@ class InitializationReport(Sections):
 
     def _examine(self):
         with jax.ensure_compile_time_eval():
-            yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read, SUSPICIOUS)
+            # Those of a system whose parameters were solved for belong to the values before.
+            sizes = None if self.solved else np.asarray(self._system.typical_sizes, float)
+            yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read, sizes, SUSPICIOUS)
 
     def _numbers(self) -> tuple[np.ndarray, tuple]:
         """All parameters, those solved for included, and the networks' weights."""

@@ -90,6 +90,7 @@ def examine_blocks(
     t: float,
     x,
     inputs: Callable[[], np.ndarray],
+    sizes: np.ndarray | None = None,
     limit: float = ILL_CONDITIONED,
 ) -> Iterator[BlockFinding]:
     """The blocks that are singular at a state, or ill-conditioned, in the order they are solved; the first singular
@@ -99,6 +100,7 @@ def examine_blocks(
 
     - `parameters`, `x`: flat arrays.
     - `inputs`: a function that gives the values of the inputs' quantities; called only if there are any.
+    - `sizes`: the typical sizes of all quantities, where the caller has them.
     - `limit`: the condition number from which on a block is reported.
     """
     check = _plan_check(plan)
@@ -110,7 +112,8 @@ def examine_blocks(
     if quantities.n > quantities.n_unknown:
         values[quantities.n_unknown :] = inputs()
     parameters = np.asarray(parameters, float)
-    known = Known(Point.of(values, parameters, t, Networks(networks)), typical_sizes(plan.model, parameters))
+    sizes = typical_sizes(plan.model, parameters) if sizes is None else sizes
+    known = Known(Point.of(values, parameters, t, Networks(networks)), sizes)
     for k, step in enumerate(plan.steps):
         if k not in check.examined | check.solved:
             continue

@@ -149,6 +149,8 @@ class AcausalSystem(eqx.Module):
         if known is None or is_traced(self.typical_sizes):
             return self.typical_sizes
         sizes = typical_sizes(plan.model, plan.flat.parameters.everything(known))
+        if np.array_equal(sizes, self.typical_sizes):  # nearby values have the same
+            return self.typical_sizes
         with jax.ensure_compile_time_eval():
             return jnp.asarray(sizes, self.typical_sizes.dtype)
 
