@@ -37,10 +37,12 @@ from .transformed import Function, Traceable
 
 # Of the mappings that Linux allows, and of the memory that this process could have. What is left must hold what is
 # compiled until use is measured next: a gradient takes 800 (two states) to 4,500 mappings (double pendulum), 7 %.
-SHARE = 0.5  # beyond which programs kept here go, the least recently used first
-FULL = 0.75  # beyond which, with none left here to go, JAX's own caches are cleared
-AGAIN = 0.125  # by which use must have grown since something was freed: programs in use must not push each other out
-COUNT = 64  # programs kept where the system says nothing: 4 GB at the 66 MB of the tutorial's
+SHARE = 0.5  # above this use, the least recently used programs are dropped
+FULL = 0.75  # above this use, with no program left to drop, JAX's own caches are cleared
+# Nothing is dropped again before use has grown by this much. If the programs of a loop do not fit together, each call
+# would otherwise drop the program that the next one needs.
+AGAIN = 0.125
+COUNT = 64  # programs kept where the system does not tell its use: 4 GB at the 66 MB of the tutorial's program
 PART = 4  # one of so many programs goes before use is measured again
 MOST_TEXTS = 1000  # digests of texts that are remembered
 PAUSE = 100  # a measurement takes some 2 µs for each mapping, up to 0.1 s; 1 % of the time may go into it
@@ -166,6 +168,8 @@ class ProgramCache:
         """Calls `function(*args, **kwargs)` through the program compiled at the first call of this kind."""
         call, arrays = _call_of(function, args, kwargs)
         found = content(call.function, call.structure, call.static)
+        # By content rather than by the object: a law that is defined again in a notebook's cell is the same law, and
+        # one that reads a global which has changed is another.
         key = found.digest, optimize, call.types, call.around
         if found.unseen:
             return self._called_unseen(call, key, optimize, arrays, found.unseen)
@@ -203,6 +207,7 @@ class ProgramCache:
         @functools.wraps(function)
         def called(*args: _P.args, **kwargs: _P.kwargs) -> _T:
             call, arrays = _call_of(function, args, kwargs)
+            # Types count beside values: 1, 1.0 and True are equal, and are not the same static argument.
             kind = call.structure, call.static, tuple(map(type, call.static)), call.types, call.around
             if kind not in known:
                 found = content(call.function, call.structure, call.static)
@@ -282,6 +287,7 @@ class ProgramCache:
 
     def _let_go(self, count: int) -> int:
         """Drops the `count` least recently used programs that are not running; returns how many were dropped."""
+        # A program that runs in another thread, or further up the stack, must not be freed under it.
         idle = [key for key, program in self._programs.items() if not program.calls][: max(count, 0)]
         for key in idle:
             self._programs.pop(key).function.clear()

@@ -33,7 +33,7 @@ class AtBound(NamedTuple):
 
 
 def at_bounds(rows: Rows, moves: Bool[np.ndarray, " p"], noise: float) -> dict[int, AtBound]:
-    """Those of the coordinates that do not move.
+    """Judges the coordinates that do not move, by their places.
 
     **Arguments:**
 

@@ -473,7 +473,7 @@ class InitializationReport(Sections):
 
 @remembered
 def _guessed(plan: SystemPlan, names: tuple[str, ...], unknown: tuple[int, ...]) -> tuple[np.ndarray, ...]:
-    """Of what the model integrates and nothing fixes, declared guesses: places in the state array, quantities,
+    """The declared guesses of what the model integrates and nothing fixes: places in the state array, quantities,
     variables, and the variables' factors."""
     rows = initial_rows(plan, names, unknown)
     held = {row.quantity for row in rows.kept[: len(rows.kept) - rows.n_soft]}
