@@ -184,6 +184,7 @@ def sample(estimate: "Estimate", draws: int, chains: int, warmup: int, seed: int
     with jax.numpy_dtype_promotion("standard"):  # BlackJAX mixes dtypes
         for k in range(chains):
             point = begin(program, told, rng)
+            # Of 32 bits, one is dropped: a larger number is no signed integer of 32 bits.
             key = jnp.asarray(np.random.SeedSequence([seed, k]).generate_state(1)[0] >> 1, jnp.int32)
             found.append(chain(program, told, warmup, draws, point, key))
     u, density, diverged, steps = (np.stack([np.asarray(one[j]) for one in found]) for j in range(4))
