@@ -8,7 +8,7 @@ event are discrete variables; the others are expressions, put in wherever they a
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 import sympy
@@ -71,7 +71,7 @@ class Scope:
             flat.classes, self.value, special,
             LEFT_OUT | EXTERNALS | self.random.functions() | {ROOT: self._root}
             | {name: functools.partial(self._read_table, EXTERNALS[name]) for name in GET_VALUE},
-            self.entries, self._named,
+            self.entries, self._named, self._opaque,
         )  # fmt: skip
         self.discrete = DiscreteEquations(component, self.interpreter.quieted)
         self.kept = self.discrete.kept
@@ -359,6 +359,18 @@ class Scope:
             self.names[e] = self.component.variable(name)
             self.component.add_equations(sympy.Eq(self.names[e], self.kept.in_equations(e), evaluate=False))
         return self.names[e]
+
+    def _opaque(self, function: Callable, arguments: Sequence[Value], count: int) -> Sequence[Value]:
+        """The results of a function of JAX, as variables; its arguments are variables, too."""
+        c = self.component
+        inputs: list[sympy.Symbol] = []
+        for value in arguments:
+            if not isinstance(value, VariableSymbol) or value.order:
+                symbol = c.variable(f":argument[{len(c.variables)}]")
+                c.add_equations(sympy.Eq(symbol, value, evaluate=False))
+                value = symbol
+            inputs.append(value)
+        return c.function(f":loop[{len(c.learned_terms)}]", function, inputs, count)
 
     def _root(self, *arguments: Value) -> Value:
         return root(self.component, self.interpreter.guards, *arguments)

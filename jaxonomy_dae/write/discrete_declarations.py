@@ -67,8 +67,8 @@ class DiscreteDeclarations(RelationDeclarations):
         flows = next(_flowing(found), None)
         if flows is not None:
             raise ModelError(
-                f"{where}({variable}, …): the value changes with '{flows}' between events, and a discrete variable does "
-                f"not: compare '{flows}' in a condition, read it in a branch of a Piecewise, or write self.output(…)"
+                f"{where}({variable}, …): the value changes with '{flows}' between events, and a discrete variable "
+                f"does not: compare it in a condition, read it in a branch of a Piecewise, or write self.output(…)"
             )
         self.discrete_equations[variable] = found
 

@@ -42,7 +42,7 @@ class Iteration(eqx.Module):
         moves_on = ~circles & ((count & (count - 1)) == 0)  # at 0, 1, 2, 4, …
         anchor, turning = jnp.where(moves_on, q, self.anchor), jnp.where(moves_on, 0.0, turning)
         numbers = jnp.where(circles, -(count + 1), count + 1), moved & ~moves_on
-        after = jnp.concatenate([jnp.stack(numbers).astype(q.dtype), anchor, turning])
+        after = jnp.concatenate([jnp.stack([number.astype(q.dtype) for number in numbers]), anchor, turning])
         return Iteration(jnp.where(count < 0, self.packed, after))
 
     def anew(self, where: Bool[Array, ""]) -> "Iteration":
