@@ -37,6 +37,7 @@ def resolved(objective: Objective, found: Minimum, steps: int) -> tuple[Objectiv
         found = dataclasses.replace(found, resolution=error)
         if error <= NOTICED:
             break
+        # Errors fall about in proportion to the tolerance.
         finer = here.finer(float(np.clip(SAFE * NOTICED / error, 1e-4, 0.5 * BESIDE)))
         again = None if finer is None else finer.lowest(found.z, steps, first=found.weights)
         if finer is None or again is None:
