@@ -3,7 +3,7 @@
 Source: modelica/fmi-ls-dae, version 0.0.1 of April 2026, a draft.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 PATH = "extra/org.fmi-standard.fmi-ls-dae/fmi-ls-manifest.xml"
@@ -20,7 +20,7 @@ class Formulation(NamedTuple):
 
 
 def manifest(
-    algebraics: Sequence[int], slopes: dict[int, Sequence[int]], residuals: Sequence[Sequence[Formulation]]
+    algebraics: Sequence[int], slopes: Mapping[int, Sequence[int]], residuals: Sequence[Sequence[Formulation]]
 ) -> str:
     """The XML text. `slopes` has what the derivatives of states depend on; `residuals` groups each equation with its
     derivatives."""
