@@ -224,8 +224,11 @@ class SystemPlan:
 
     @functools.cached_property
     def takes_roots(self) -> bool:
-        """True if an equation takes a root of a quantity itself, whose slope is infinite at zero."""
+        """True if an equation takes a root of a quantity itself, whose slope is infinite at zero, and all functions of
+        the model can be differentiated in both modes."""
         templates = {id(group.template): group.template for group in self.extended.groups}.values()
+        if self.network_names or any(template.opaque is not None for template in templates):
+            return False
         symbolic = [template for template in templates if isinstance(template, SymbolicTemplate)]
         return any(takes_roots([t.graph], set(map(slot_label, t.slots)).__contains__) for t in symbolic)
 

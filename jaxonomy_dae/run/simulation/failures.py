@@ -11,7 +11,7 @@ from ...base.aliases import Inputs, Result, State, Time
 from ...base.errors import SimulationError
 from ...base.tolerances import CONSISTENT
 from ...compile.diagnosis.lost_cancellation import lost_cancellation
-from ...compile.diagnosis.wording import listed, quoted
+from ...compile.diagnosis.wording import listed, quoted, some
 from ...compile.lowering.plan import SystemPlan
 from ...compile.model.events import Event
 from ...host.members import is_batched
@@ -31,6 +31,7 @@ from .failed_blocks import failed_block, singular_mode
 from .hybrid_problem import RESTART, resolution
 from .lost_constraints import lost_constraint
 from .preparation import term_of
+from .repeated_events import turning_in_turn, writes_what_holds
 from .solution import Solution
 
 # A run that failed for another reason (steps too short, too many) is explained by a singular choice of states if a
@@ -161,7 +162,7 @@ def _of_event(solution: Solution, at: Stopped, max_events: int) -> str:
     if at.result == TOO_MANY:
         return _too_many_events(solution.events, max_events, t)
     if at.result == STUCK:
-        return _stuck(solution, int(log.stuck), t, MOVED * float(resolution(at.t0, at.t1)))
+        return _stuck(solution, int(log.stuck), at)
     return _clash(solution, int(log.stuck), t) if at.result == CLASH else ""
 
 
@@ -233,11 +234,14 @@ def _too_many_events(events: Events, max_events: int, t: float) -> str:
     return f"{text}."
 
 
-def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
-    """Says why event number `event` happens, or its relation turns, again and again at t, an instant of that length."""
-    table = solution.system.plan.some_events
+def _stuck(solution: Solution, event: int, at: Stopped) -> str:
+    """Says why event number `event` happens, or its relation turns, again and again at one instant."""
+    t, instant = float(at.t), MOVED * float(resolution(at.t0, at.t1))
+    system, inputs = solution.system, solution.inputs
+    table = system.plan.some_events
     if EventFlag.RELATION in table.table.events[event].flags:
-        return _sliding(table.table.events[event], t)
+        together = turning_in_turn(system, event, (at.t, at.y), abs(float(at.t1 - at.t0)), inputs)
+        return _in_turn([table.table.events[k] for k in together], t) or _sliding(table.table.events[event], t)
     times, which = np.asarray(solution.events.ts), np.asarray(solution.events.which, int)
     # Where events accumulate, the last ones follow each other as rounding has it.
     lately = times > t - instant
@@ -258,6 +262,16 @@ def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
         return (
             f"{text}: what one of them writes makes the other one's condition true at once. Let the conditions for "
             f"switching on and off lie apart (hysteresis). {REST}"
+        )
+    same = writes_what_holds(system, event, (at.t, at.y), inputs)
+    if same:
+        name, value = same[0]
+        short = name.split(".", 1)[-1]
+        return (
+            f"the integration stopped at t={t:.6g}: {listed(names)} would happen again and again there, and change "
+            f"nothing: {some([f'{n} = {v:g}' for n, v in same])} holds already, and the equations of this mode keep "
+            f"the condition on the verge of being true. Let it count in the other mode only, "
+            f"when(…, on=Ne({short}, {value:g}))"
         )
     return (
         f"{text}: what it writes leaves its condition on the verge of being true, and the equations make it true at "
@@ -305,6 +319,20 @@ def _of_kinks(system: AcausalSystem) -> str:
     return (
         f". If it is a constraint that has a kink where a relation turns ({shown}), speeds jump there: round the kink, "
         "or say with self.complementary what pushes"
+    )
+
+
+def _in_turn(relations: list[Event], t: float) -> str:
+    """Explains relations that turn one after the other, ever faster; "" if there are none."""
+    if not relations:
+        return ""
+    which = "; ".join(f"'{e.condition}' of component '{e.owner}'" for e in relations)
+    return (
+        f"the integration stopped at t={t:.6g}: relations turn one after the other, ever faster (Zeno behaviour): "
+        f"{which}. The solution comes to where all of them are equal, and is driven back to none of these surfaces by "
+        f"itself. What it does from there on the equations leave open: end the run before, with "
+        "when(…, terminate(…)), let an event assign a mode in which it rests, or round the corner with a smooth law, "
+        "for instance tanh(x/small) instead of sign(x)"
     )
 
 
