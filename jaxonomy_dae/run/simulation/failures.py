@@ -118,6 +118,9 @@ def explain(solution: Solution, at: Stopped, x0: State, implicit: bool, max_even
     if others and not written and not system.is_constrained and system.plan.held is None:
         return singular_mode(system, first, (t, x), inputs) + _of_short_circuits(system)
     written = written or others
+    gap = _gap_at_event(solution, at) if written else ""
+    if gap:
+        return stopped + gap
     if written:
         return f"{stopped}an event gave {written} a value that is not finite" + (
             ", or it entered a mode whose constraint does not hold at that instant (its gap or speed is not zero), or "
@@ -185,6 +188,32 @@ def mode_at_start(system: AcausalSystem, inputs: Inputs, t0: Time, x0: State) ->
     return (
         f"the run cannot begin at t={float(t0):g} in the mode of " + "; ".join(lines) + ". Give starts at which these "
         "are zero, or begin in the other mode"
+    )
+
+
+def _gap_at_event(solution: Solution, at: Stopped) -> str:
+    """Names the constraints of modes that the last event entered though they do not hold where it happened, and by how
+    much; "" if all of them hold or it is not known what was before."""
+    system, inputs, log, t = solution.system, solution.inputs, solution.event_log, float(at.t)
+    held, n = system.plan.held, len(system.plan.nominal)
+    last = 0 if log is None else int(log.count) - 1
+    if held is None or log is None or not 0 <= last < len(log.before):
+        return ""
+    x, q = log.before[last][:n], log.before[last][n:]
+    at_once = abs(float(log.ts[last]) - t) <= MOVED * float(resolution(at.t0, at.t1))
+    if not at_once or not np.isfinite(np.asarray(x)).all():
+        return ""
+    begun = np.asarray(system.at(t, inputs).held(x)[0]) > np.asarray(system.holding(q).at(t, inputs).held(x)[0])
+    levels = np.asarray(system.at(t, inputs).held(x)[1])
+    gaps = {k: float(levels[held.table.owner == k][0]) for k in np.flatnonzero(begun).tolist()}
+    size = CONSISTENT * float(np.max(np.abs(np.asarray(x)[: len(system.plan.states)]), initial=1.0))
+    lines = [f"'{held.table.text[k]}', where it is {gap:.3g}" for k, gap in gaps.items() if abs(gap) > size]
+    if not lines:
+        return ""
+    return (
+        f"'{solution.events.names[-1]}' began a mode whose constraint does not hold there: {some(lines)}. No impulse "
+        "closes a gap. Let the mode begin where the constraint holds, with that as the event's condition, or write the "
+        "states with reinit(...)"
     )
 
 
