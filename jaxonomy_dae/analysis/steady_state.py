@@ -31,7 +31,8 @@ class Drifting(NamedTuple):
 
 
 WORST = 4  # equations, or directions, that an error names
-IN_DIRECTION = 0.1  # of its largest entry: what else belongs to a direction that nothing determines
+# An unknown belongs to a direction that nothing determines if its entry is at least this part of the largest one.
+IN_DIRECTION = 0.1
 
 
 @explained_keywords()

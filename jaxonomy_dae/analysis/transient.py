@@ -16,8 +16,10 @@ from ..solve.linear.dense import least_squares
 
 STEPS = 200  # from a hundredth of the fastest time constant, three times as long each, they pass thirty decades
 LONGER, SHORTER = 3.0, 0.25
-LEFT = 0.5  # of a step's equation, after its Newton step: the part of the slope that may be
-NEAR = 1e-3  # of slopes at the start: then Newton's method does the rest
+# A step is kept if its Newton step has left at most this part of the slope in the step's equation.
+LEFT = 0.5
+# Relative to slopes at the start. From slopes so small on, Newton's method does the rest.
+NEAR = 1e-3
 
 
 def pseudo_transient(

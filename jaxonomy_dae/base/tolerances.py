@@ -75,8 +75,9 @@ def close(dtype: DTypeLike) -> float:
 
 
 def ridge(dtype: DTypeLike) -> float:
-    """What directions that a matrix leaves open are held by, beside rows of size one: far below the rounding of what
-    only such directions feel. A solution in directions of the size σ is off by up to (ridge/σ)² of itself."""
+    """The weight of rows that hold the directions which a matrix leaves open, beside rows of size one. It is far below
+    the rounding of what only such directions feel. A solution in directions of the size σ is off by up to (ridge/σ)² of
+    itself."""
     return spacing(dtype) ** 0.75
 
 

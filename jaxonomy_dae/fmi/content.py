@@ -1,4 +1,4 @@
-"""What of a system is written in C: its programs, where their numbers stand, and the texts of messages."""
+"""The parts of a system that are written in C: its programs, where their numbers stand, and the texts of messages."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -182,7 +182,7 @@ def _of_processor(platforms: Sequence[Sequence[str] | None]) -> int:
 
 
 def _solve_alone(params: Mapping[str, Any], read: tuple[Atom, ...]) -> tuple[str, Mapping[str, Any], tuple[Atom, ...]]:
-    """Of a linear solve with its products and its transpose, the call that solves."""
+    """The call that solves, taken out of a linear solve with its products and its transpose."""
     lengths = params["const_lengths"]
     begin = lengths.matvec + lengths.vecmat
     end = begin + lengths.solve

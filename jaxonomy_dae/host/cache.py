@@ -11,13 +11,14 @@ holds the function, nor what it closes over.
 
 import functools
 import gc
+import operator
 import os
 import threading
 import time
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -36,10 +37,12 @@ from .transformed import Function, Traceable
 
 # Of the mappings that Linux allows, and of the memory that this process could have. What is left must hold what is
 # compiled until use is measured next: a gradient takes 800 (two states) to 4,500 mappings (double pendulum), 7 %.
-SHARE = 0.5  # beyond which programs kept here go, the least recently used first
-FULL = 0.75  # beyond which, with none left here to go, JAX's own caches are cleared
-AGAIN = 0.125  # by which use must have grown since something was freed: programs in use must not push each other out
-COUNT = 64  # programs kept where the system says nothing: 4 GB at the 66 MB of the tutorial's
+SHARE = 0.5  # above this use, the least recently used programs are dropped
+FULL = 0.75  # above this use, with no program left to drop, JAX's own caches are cleared
+# Nothing is dropped again before use has grown by this much. If the programs of a loop do not fit together, each call
+# would otherwise drop the program that the next one needs.
+AGAIN = 0.125
+COUNT = 64  # programs kept where the system does not tell its use: 4 GB at the 66 MB of the tutorial's program
 PART = 4  # one of so many programs goes before use is measured again
 MOST_TEXTS = 1000  # digests of texts that are remembered
 PAUSE = 100  # a measurement takes some 2 µs for each mapping, up to 0.1 s; 1 % of the time may go into it
@@ -91,16 +94,30 @@ def options() -> list[tuple[str, object]]:
     return [(name, getattr(config, name, value)) for name, value in config.values.items()]
 
 
-_OPTIONS: list[tuple[list[tuple[str, object]], str]] = []  # those seen last, and their digest
+class _Options(NamedTuple):
+    """Options as they were seen last: what reads those of this thread, all their values, and the digest."""
+
+    of_thread: Callable[[Any], tuple[object, ...]]
+    values: tuple[object, ...]
+    digest: str
+
+
+_OPTIONS: list[_Options] = []
 
 
 def _of_options() -> str:
-    now = options()
-    for before, digest in _OPTIONS:
-        if len(before) == len(now) and all(a[1] is b[1] for a, b in zip(before, now, strict=True)):
+    """The digest of JAX's options. Every eager call asks for it, so objects that are still the same ones are not looked
+    at by name: 10 µs in place of 70."""
+    config: Any = jax.config
+    for of_thread, values, digest in _OPTIONS:
+        now = *config.values.values(), *of_thread(config)
+        # Libraries that are imported later may add options, and none is ever taken away.
+        if len(now) == len(values) and all(map(operator.is_, now, values)):
             return digest
-    digest = content(now).digest
-    _OPTIONS[:] = [(now, digest)]
+    # A few options are no attributes: a thread cannot change these for itself.
+    of_thread = operator.attrgetter(*(name for name in config.values if hasattr(config, name)))
+    digest = content(options()).digest
+    _OPTIONS[:] = [_Options(of_thread, (*config.values.values(), *of_thread(config)), digest)]
     return digest
 
 
@@ -151,6 +168,8 @@ class ProgramCache:
         """Calls `function(*args, **kwargs)` through the program compiled at the first call of this kind."""
         call, arrays = _call_of(function, args, kwargs)
         found = content(call.function, call.structure, call.static)
+        # By content rather than by the object: a law that is defined again in a notebook's cell is the same law, and
+        # one that reads a global which has changed is another.
         key = found.digest, optimize, call.types, call.around
         if found.unseen:
             return self._called_unseen(call, key, optimize, arrays, found.unseen)
@@ -188,6 +207,7 @@ class ProgramCache:
         @functools.wraps(function)
         def called(*args: _P.args, **kwargs: _P.kwargs) -> _T:
             call, arrays = _call_of(function, args, kwargs)
+            # Types count beside values: 1, 1.0 and True are equal, and are not the same static argument.
             kind = call.structure, call.static, tuple(map(type, call.static)), call.types, call.around
             if kind not in known:
                 found = content(call.function, call.structure, call.static)
@@ -267,6 +287,7 @@ class ProgramCache:
 
     def _let_go(self, count: int) -> int:
         """Drops the `count` least recently used programs that are not running; returns how many were dropped."""
+        # A program that runs in another thread, or further up the stack, must not be freed under it.
         idle = [key for key, program in self._programs.items() if not program.calls][: max(count, 0)]
         for key in idle:
             self._programs.pop(key).function.clear()

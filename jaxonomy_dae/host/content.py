@@ -92,6 +92,7 @@ class _Walk:
 
     def part(self, part: Any) -> None:
         kind = type(part)
+        # With the type: `repr` alone would make the text "1" and the number 1 one.
         if kind in _PLAIN:
             return self.say(kind.__name__, repr(part))
         if kind is tuple:
@@ -114,6 +115,7 @@ class _Walk:
         known = self._seen.get(id(part))
         if known is not None:
             return self.say("again", str(known[0]))
+        # Before the walk goes inside, so that an object that contains itself ends it.
         self._seen[id(part)] = len(self._seen), part
         try:
             self._one(part, kind)
@@ -190,6 +192,8 @@ class _Walk:
         for member in part:
             if not _is_plain(member):
                 return self.hidden(f"a set with an object of type {type(member).__qualname__}")
+            # Each member by a walk of its own: references to what was seen before depend on the order, and sets have
+            # none.
             members.append(content(member).digest)
         self.say("set", *sorted(members))
 
@@ -248,6 +252,8 @@ class _Walk:
         whose = owner(function.__globals__.get("__name__"))
         if whose is Owner.STANDARD:
             self.hidden(f"{function.__module__}.{function.__qualname__}()")
+        # The code of the package and of libraries does not change within a process, and for other processes a digest of
+        # their files counts.
         if whose is not Owner.USER:
             return
         if code.changes_globals:

@@ -139,12 +139,12 @@ def key(program: str) -> str | None:
 
 
 def _versions_of_backends() -> str:
-    """Of the driver and the plug-in of a GPU, too."""
+    """The versions of the backends, with those of the driver and the plug-in of a GPU."""
     return "; ".join(sorted({f"{d.platform} {d.client.platform_version}" for d in jax.devices(platform())}))
 
 
 def machine_and_versions() -> dict[str, str]:
-    """What an executable of this process is made for, by what that is."""
+    """What an executable of this process is made for: versions, backend and processor, by name."""
     jaxlib = sys.modules.get("jaxlib")
     return {
         "version of JAX": jax.__version__,
@@ -208,6 +208,7 @@ def _write(path: Path, content: bytes) -> None:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not _usable(path.parent):
             return
+        # A rename is atomic within one folder: a reader sees the whole file or none.
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix="new-", suffix=".program", delete=False) as file:
             draft = file.name
             file.write(hashlib.sha256(content).digest() + content)
@@ -226,11 +227,14 @@ def _read(path: Path) -> bytes | None:
     if not _usable(path.parent):
         return None
     try:
+        # By the open file rather than by its path: between a check of the path and its opening, the file could be
+        # exchanged.
         opened = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0))
         with open(opened, "rb") as file:
             if hasattr(os, "getuid") and os.fstat(opened).st_uid != os.getuid():
                 return None
             whole = file.read()
+        # The date of use, by which files are deleted: many systems do not keep one of reading.
         os.utime(path)
     except OSError:
         return None

@@ -79,6 +79,7 @@ def owner(name: object) -> Owner:
 def _owner(name: str, identity: int) -> Owner:
     """`identity` is that of the module, so that another one of the same name is looked at anew."""
     module, root = sys.modules[name], name.partition(".")[0]
+    # A name proves nothing: a user's module may be called like one of a library, and lie elsewhere.
     if root == PACKAGE or root in LIBRARIES:
         if not _lies_in(module, root):
             return Owner.USER
@@ -202,6 +203,7 @@ def code() -> str:
     for root in LIBRARIES:
         for folder in _folders(root):
             for name, *status in _files(folder):
+                # The process has imported an earlier version of this file, whose content nobody knows any more.
                 if status[-1] > _READ_AT - _RESOLUTION:
                     raise Changed
                 found.update(f"{name}\0{status}\0".encode())

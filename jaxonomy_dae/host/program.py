@@ -165,6 +165,7 @@ class Program:
     def _read(self) -> bool:
         """Takes the executable that another program of this process has, or that an earlier process has kept. True if
         there is one."""
+        # Functions of different content may compute the same, and then have one text.
         there = _EXECUTABLES.get(self._key)
         if there is not None:
             self._executable, self._doubted = there, False
@@ -208,6 +209,8 @@ class Program:
     def _first_run(self, arrays: list[Array], function: Callable[..., PyTree]) -> list[Array]:
         """The first run of an executable that was read: one that does not run is compiled anew."""
         try:
+            # An executable that was read may fail only when it runs. JAX returns before that, so the error is waited
+            # for.
             found = jax.block_until_ready(self._executable.run(arrays))
         except jax.errors.JaxRuntimeError:
             text, lowered = self._staged(function, arrays)
@@ -219,7 +222,7 @@ class Program:
 
 
 def types_of_structs(arrays: Iterable[jax.ShapeDtypeStruct]) -> str:
-    """As `types_of`, of what stands for arrays."""
+    """As `types_of`, for structs that stand for arrays."""
     return repr([(a.shape, a.dtype.name, a.weak_type, str(a.sharding)) for a in arrays])
 
 

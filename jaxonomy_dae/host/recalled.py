@@ -18,6 +18,7 @@ def record(program: str, calls: list[str], outcome: PyTree) -> bytes | None:
     would not give the same."""
     try:
         content = written((program, calls, outcome))
+        # What does not come back the same would make another outcome in the next process, without a word.
         return content if written(read(content)) == content else None
     except NotData:
         return None

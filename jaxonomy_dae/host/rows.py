@@ -29,6 +29,7 @@ def filled_up(rows: PyTree) -> PyTree:
     def filled(array: Array) -> Array:
         values = np.asarray(array)
         more = size_for(len(values)) - len(values)
+        # Copies of the last row rather than zeros: they are times inside the run, and cost no step.
         return on_device(np.concatenate([values, np.repeat(values[-1:], more, axis=0)])) if more else array
 
     return jax.tree.map(filled, rows)

@@ -76,6 +76,8 @@ class Function:
                 return self._held[-1](arrays)
 
             run.__name__ = run.__qualname__ = self.name
+            # The function is looked up when it is traced, so that JAX's cache, which never forgets, holds no function
+            # of the user's.
             self._transformed = eqx.filter_jit(run)
         self._held.append(function)
         try:
@@ -136,6 +138,8 @@ class Function:
             known = [one.value for one in given]
             smooth, rest, pullback = values(valued, known)
             shape[:] = [rest]
+            # A program that was recalled may have to be traced again for its pullback, and needs the arguments for
+            # that.
             return smooth, (pullback, known if pullback.structure.value is None else [])
 
         def backward(residuals: tuple["_Pullback", list[Array]], cotangents: list[PyTree]) -> PyTree:
@@ -227,6 +231,8 @@ class Function:
         """The outcome under one `jax.vmap` of known values."""
         axes = [getattr(a, "batch_dim", None) for a in arrays]
         values = [[*layers(a)][-1] for a in arrays]
+        # The batch is computed at once, outside of JAX's batching. One traced array then stands for its result, which
+        # JAX asks for member by member.
         k = next(k for k, axis in enumerate(axes) if axis is not None)
         size = values[k].shape[axes[k]]
 

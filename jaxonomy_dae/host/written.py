@@ -47,6 +47,7 @@ def read(text: bytes) -> PyTree:
 
 def _out(part: Any) -> Any:
     kind = type(part)
+    # By their very types: an object of a subclass would come back as one of its base.
     if part is None or kind in (bool, int, str):
         return part
     if kind in (tuple, list):

@@ -21,7 +21,8 @@ from .objective import Objective
 
 GROWING = (0.1, 0.25, 0.5, 1.0)  # shares of the time, each two to two and a half times the one before
 FAR = 10.0  # root mean square residual, in units of the noise, beyond which a network is fitted from coarse to fine
-SPREAD = 0.1  # of an output's standard deviation: the same, where its noise is not known
+# The same in units of an output's standard deviation, where its noise is not known.
+SPREAD = 0.1
 
 
 def silent(objective: Objective, point: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:

@@ -21,11 +21,14 @@ if TYPE_CHECKING:
 
 WIDEST = 40  # states, beyond which answers cost more than the fit did
 PLACES = 24  # at which a step of a disturbance is tried
-PARTS = 16  # of the time between two samples, in which an input is read
+# An input is read at so many times between two samples.
+PARTS = 16
 EDGE = 4  # samples on each side of a step
-TAKEN = 1e-4  # of a column's square, below which the model's own numbers take it up
+# Of a column's square. Where less is left of it beside the model's own numbers, these take it up.
+TAKEN = 1e-4
 DAY = 86400.0  # s
-TURNS = 0.02  # of its size, that a state must be beyond zero on both sides
+# Of its size. A state changes its sign if it goes beyond zero by this much on both sides.
+TURNS = 0.02
 FORM = 4  # coefficients of a polynomial that stands for a law of another form
 DAYS = 2  # in a record, from which a daily disturbance is looked for
 
@@ -59,7 +62,7 @@ class Judge:
 
     @classmethod
     def of(cls, fit: "Estimate", left: Leftover) -> "Judge":
-        """That of a fit, as if outliers had not been fitted."""
+        """The judge of a fit, as if outliers had not been fitted."""
         judged = np.zeros(len(left.scores), bool)
         for at in left.by_output.values():
             judged[at] = True

@@ -193,7 +193,7 @@ def _half_waves(n: int) -> Float[np.ndarray, "n k"]:
 
 
 def _period(judge: Judge, series: Sequence[Series], times: np.ndarray) -> float:
-    """That of the highest peak that the series with as many samples as the first have in common."""
+    """The period of the highest peak that the series with as many samples as the first one have in common."""
     alike = [one for one in series if len(one.at) == len(series[0].at)]
     power = sum(periodogram(judge.residual[None, one.at])[0] for one in alike)
     length = np.ptp(times) * len(times) / (len(times) - 1)

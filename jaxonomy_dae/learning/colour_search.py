@@ -17,8 +17,10 @@ from .descent import Minimum
 from .evaluation import Weights
 from .objective import Objective
 
-LARGEST = 0.999  # of ρ: beyond, a thousand samples say less than one
-ROUNDS = 20  # of ρ and estimates in turn
+# The bound of ρ. Beyond it, a thousand samples say less than one.
+LARGEST = 0.999
+# How often ρ and the estimates are found in turn, at most.
+ROUNDS = 20
 SETTLED = 1e-7  # change of ρ at which these end
 
 

@@ -25,8 +25,8 @@ TRIALS = 12  # dampings tried from one point: the last is 6¹² times the first
 PATIENCE = 3  # steps in a row without gain
 PERSISTENCE = 12  # the same, where what is reported still has a way to go: small gains add up along a curved valley
 OFFSET = 1e-3  # of the confidence region's radius, what may be left to go (Bates & Watts 1981, Technometrics 23:179)
-# Of its standard deviation, by which anything that is reported may move yet where no step gains more: it adds 2 % to
-# errors.
+# Of its standard deviation: how far anything that is reported may still have to go where no step gains more. Errors
+# grow by 2 % for it.
 CLOSE = 0.2
 POLISHED = 12  # steps at the end, as long as three of them leave less than a third
 MIXED = 4  # earlier steps that these are mixed with (Walker & Ni 2011: three to five suffice)

@@ -44,8 +44,10 @@ if TYPE_CHECKING:
 
 WORTH_MENTIONING = 2.0  # differences of the criterion below are "not worth more than a bare mention" (Kass & Raftery)
 GRID = 400  # points of the ranges of numbers inside terms: 400 of one, 20 × 20 of two, 7 × 7 × 7 of three
-TOGETHER = 50  # of them in one call: with 400 samples and ten terms, 2 MB
-VALLEYS = 2  # of the network's curve from which numbers inside terms are fitted to the data
+# Points of the grid in one call: with 400 samples and ten terms, 2 MB.
+TOGETHER = 50
+# Numbers inside terms are fitted to the data from the bottoms of so many valleys of the network's curve.
+VALLEYS = 2
 # The range of a number inside, if nothing is said, around 1 and around the size of the inputs. Smaller scales lie below
 # what sampling resolves, and larger ones beyond what was explored.
 NARROW, WIDE = 1e-3, 10.0

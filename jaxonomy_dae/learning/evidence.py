@@ -20,9 +20,13 @@ from ..host.threads import one_thread
 from .evaluation import Evaluation, Weights
 from .factors import Factors
 
-HEAVIEST = 1e4  # of the squares of the data's columns, what those of a prior of smoothness may be
-LIGHTEST = 1e-16  # of this, what is no prior any more, relative to rounding
-FAINT = 0.1  # of a degree of freedom: a prior of derivatives that leaves less need not be stronger
+# A prior of smoothness may weigh so much more than the data at most, in squares of their columns.
+HEAVIEST = 1e4
+# A prior that is a smaller part of the heaviest one is lost in rounding.
+LIGHTEST = 1e-16
+# Where the data determine fewer degrees of freedom than this of what a prior of derivatives is about, it need not be
+# stronger.
+FAINT = 0.1
 NEAR = 2.0  # χ² for each sample, beyond which it is the misfit that speaks, and precisions of priors stay as they are
 
 

@@ -251,7 +251,8 @@ def _noise_unit(place: int | str, unit: str) -> str:
 
 
 def _increments(stacked: Stacked, j: int) -> tuple[float, float]:
-    """The root mean squares of what an output changes by from sample to sample, and of that per √time."""
+    """Two root mean squares: of the changes of an output from one sample to the next, and of these changes divided by
+    the root of the time between."""
     steps, rates, often = [], [], []
     for k in _fitted(stacked):
         seen = stacked.observed[k, :, j]

@@ -91,7 +91,7 @@ def natural_scale(objective: Objective, z: Float[np.ndarray, " f"], found: Evalu
 
 
 def signals(objective: Objective) -> Float[np.ndarray, " m"]:
-    """By how much the output that each sample is of varies in the data; the size of one that does not."""
+    """For each sample, by how much its output varies in the data; the output's size if it does not vary."""
     s, rows = objective.stacked, objective.rows
     values, out = s.values[rows], np.ones(len(rows[0]))
     for j in np.unique(rows[2]):

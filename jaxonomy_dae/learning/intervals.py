@@ -16,7 +16,9 @@ from .objective import AWAY, Objective
 from .table import Row, Table
 
 FURTHEST = 10  # doublings of the linear interval before an end counts as infinite
-SILENT = 0.98  # of its prior's spread: data that narrow it by less say as much as a sample of five times that spread
+# Data that leave more than this part of a prior's spread say nothing: a sample of five times that spread would narrow
+# it as much.
+SILENT = 0.98
 
 
 def profile(

@@ -30,7 +30,7 @@ class SumOfSquares(AbstractMerit):
     residual: Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " m"] | None] | None
 
     def cost(self, z: Float[np.ndarray, " p"], weights: Weights) -> float:
-        """By the residuals alone, if they can be had alone."""
+        """The cost at a point, by the residuals alone if they can be had alone."""
         if self.residual is None:
             found = self.evaluate(z)
             tried = None if found is None else found.residual
@@ -39,7 +39,7 @@ class SumOfSquares(AbstractMerit):
         return np.inf if tried is None else weights.cost(z, tried)
 
     def rows(self, z: Float[np.ndarray, " p"], weights: Weights) -> Float[np.ndarray, " r"] | None:
-        """By the residuals alone, if they can be had alone."""
+        """The rows at a point, by the residuals alone if they can be had alone."""
         tried = None if self.residual is None else self.residual(z)
         return None if tried is None else np.concatenate([weights.bent(tried)[0], weights.prior(z).residual])
 
@@ -62,9 +62,9 @@ class SumOfSquares(AbstractMerit):
         return max(0.5 * OFFSET * columns * variance, GAIN * cost)
 
     def at(self, z: Float[np.ndarray, " p"], found: Evaluation, weights: Weights) -> Weights:
-        """The same."""
+        """The weights at a point: the same ones."""
         return weights
 
     def next_weights(self, here: Weights, better: Weights) -> Weights:
-        """Better ones."""
+        """The weights to go on with: the better ones."""
         return better

@@ -30,14 +30,16 @@ from .outliers import heavy_tails, outliers
 if TYPE_CHECKING:
     from .estimate import Estimate
 
-LEVEL = 0.02  # of right models, the share that is doubted: fewer than one in twenty, whatever other reasons add
+# The share of right models that is doubted: fewer than one in twenty, whatever other reasons add.
+LEVEL = 0.02
 # Of residuals, so that the level is a whole number of them. All fits of a model have the same draws: with 499 of these,
 # the level of one oscillator was 3.1 %.
 DRAWS = 1999
 SURE = 499  # draws after which a third of the level counts as below it: the level itself looks so once in 300 times
 BATCH = 50  # draws at once: most right models are known by the first
 ROOM = 2e7  # numbers at once: 160 MB
-BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
+# Residuals below this part of the noise that was stated, as those of exact data, need not look like noise.
+BELOW = 0.1
 FEWEST = 4  # samples of a series, below which there is nothing to correlate
 SHORTEST = 8  # frequencies of a record below which its lowest ones are those that a fit takes away
 FINE = 2  # frequencies for each that is independent: a peak between two of these loses up to three fifths of its power
@@ -85,7 +87,7 @@ class Leftover:
 
     @classmethod
     def of(cls, fit: "Estimate", counts: Iterable[tuple[int, int]]) -> "Leftover":
-        """Those of a fit. `counts`: (experiment, output) of the series whose form is judged."""
+        """What a fit leaves over. `counts`: (experiment, output) of the series whose form is judged."""
         m, o = fit.minimum, fit.objective
         experiment, _, output = o.rows
         share = m.weights.share
@@ -190,7 +192,7 @@ class Leftover:
 
     @functools.cached_property
     def cleaned(self) -> Float[np.ndarray, " m"]:
-        """What would be left over, to first order, of a fit to all samples but outliers; zero at these."""
+        """What a fit to all samples but outliers would leave over, to first order; zero at outliers."""
         far = self.outliers
         if not far.any():
             return self.scores
@@ -207,7 +209,7 @@ class Leftover:
 
     @functools.cached_property
     def _left(self) -> list[Float[np.ndarray, " _"]]:
-        """Of the power of noise at each frequency, the part that a fit leaves."""
+        """The part of the power of noise that a fit leaves, at each frequency."""
         own = self.leverage / self.share[:, None]
         return [np.maximum(1 - periodogram(own[one.at].T).sum(axis=0), 0.0) for one in self.series]
 

@@ -145,7 +145,7 @@ class _Expressions:
         return [self._written(f"{texts[0]} in output {j}", symbols, row) for j, row in enumerate(rows)]
 
     def _written(self, label: str, symbols: tuple[sympy.Symbol, ...], written: tuple[sympy.Expr, ...]) -> Written:
-        """A term, with the numbers inside it after its inputs."""
+        """A term as a function of its inputs, and after them of the numbers inside it that are found with it."""
         inside = sorted({s for e in written for s in symbols_of(e)} - set(symbols), key=str)
         numbers = tuple(Inner(s.name, dict(self.ranges).get(s.name)) for s in inside)
         return Written(label, (*symbols, *inside), written, numbers)

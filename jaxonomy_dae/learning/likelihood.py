@@ -63,16 +63,16 @@ class Scoring(AbstractMerit):
     limited: Bool[np.ndarray, " p"]
 
     def cost(self, z: Float[np.ndarray, " p"], weights: Weights) -> float:
-        """By the likelihood there, with the priors at hand."""
+        """The cost by the likelihood at a point, with the priors at hand."""
         found = self.evaluate(z)
         return np.inf if found is None else self.at(z, found, weights).cost(z, found.residual)
 
     def at(self, z: Float[np.ndarray, " p"], found: Evaluation, weights: Weights) -> Weights:
-        """Those that the model says, with the priors at hand."""
+        """The weights that the model says at a point, with the priors at hand."""
         return self.weights(z, found).with_priors_of(weights)
 
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
-        """By the likelihood there, with the priors at hand."""
+        """What is reached at a point, by the likelihood there, with the priors at hand."""
         found = self.evaluate(z)
         if found is None:
             return None

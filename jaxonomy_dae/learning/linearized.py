@@ -96,7 +96,7 @@ class Linearized:
 
     @classmethod
     def of(cls, objective: Objective, full: Float[np.ndarray, " p"]) -> "Linearized | None":
-        """That of an objective; None where a run fails or nothing moves."""
+        """The linear model of an objective; None where a run fails or nothing moves."""
         plan, s = objective.system.plan, objective.stacked
         if not len(plan.states):
             return None
@@ -139,4 +139,5 @@ class Linearized:
         return np.einsum("mf,mfq->mq", self.along.read[experiment, row, output], moved[experiment, row])
 
 
-NO_MORE = 1e-6  # of a state's size: by how much the slope of another may differ and still be this state
+# Of a state's size. A slope that differs from another state by no more than this is that state.
+NO_MORE = 1e-6

@@ -27,9 +27,14 @@ from .node_guesses import node_guesses, sizes
 from .objective import Objective
 from .segments import Point, Segments
 
-WEIGHTS = (10.0, 1e2, 1e3)  # of gaps in units of the states' ranges: at first a tenth costs one σ
-HEAVIEST = 1e7  # in the end, if multipliers alone do not close them
-SHRINK = 0.25  # of gaps from one set of multipliers to the next, as in LANCELOT (Conn, Gould & Toint 1992)
+# Weights of gaps, which are measured in the states' ranges. At first a gap of a tenth costs as much as an error of one
+# σ.
+WEIGHTS = (10.0, 1e2, 1e3)
+# The weight grows up to this one if multipliers alone do not close the gaps.
+HEAVIEST = 1e7
+# If a new set of multipliers leaves more than this part of the gaps, the weight grows, as in LANCELOT (Conn, Gould &
+# Toint 1992).
+SHRINK = 0.25
 FEW = 10  # steps at each of these weights
 SLOW = 0.01  # relative decrease of the cost by a step, below which the weight grows
 CLOSED = 0.1  # gaps that count as none, in units of the integration's relative tolerance

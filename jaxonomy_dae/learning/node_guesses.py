@@ -1,5 +1,8 @@
-"""Where the states at the nodes begin: at smoothed samples of those that were measured, and of their derivatives; else
-where runs of the segments before them end."""
+"""First guesses of the states at the nodes.
+
+Where a state or its derivative was measured, the guess is a smoothed sample. Elsewhere it is the state at which the run
+of the segment before ends.
+"""
 
 from collections.abc import Sequence
 
@@ -10,7 +13,8 @@ from ..compile.lowering.plan import SystemPlan
 from .segments import Segments
 
 FEWEST = 5  # samples to smooth: two more than a parabola has coefficients
-SETTLED = 1e-3  # of a state's size, by which sweeps may still move nodes
+# Sweeps end where they move nodes by no more than this part of a state's size.
+SETTLED = 1e-3
 
 
 def measured_states(segments: Segments) -> Float[np.ndarray, "e N n"]:

@@ -59,7 +59,7 @@ class Properties:
 
 
 def properties(fit: "Estimate", name: str) -> Properties:
-    """Those of a raw `equinox.nn.MLP`, with fits of all of them."""
+    """The properties of a raw `equinox.nn.MLP`, with fits of all of them."""
     networks = [one for one in fit.objective.layout.modules if one in fit.system.neural]
     if name not in networks:
         raise ModelError(f"properties: '{name}' is not a network that was trained: " + nearest(name, networks))

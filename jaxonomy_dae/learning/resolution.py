@@ -18,8 +18,10 @@ from .objective import Objective
 # and most by far less, as errors share but a part of any one's direction.
 NOTICED = 0.5
 EXACT = 1e-9  # of an output's size: the 30th bit, beyond what instruments tell. Errors below are those of exact data.
-BESIDE = 0.1  # of the tolerance, with which its error is measured
-SAFE = 0.3  # of the tolerance that would just do
+# A run at this part of the tolerance shows the error of a run at the tolerance.
+BESIDE = 0.1
+# The next tolerance is this part of the one that would just do.
+SAFE = 0.3
 ROUNDS = 4  # from 1e-6 to rounding
 
 

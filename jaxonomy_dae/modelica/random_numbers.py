@@ -123,7 +123,8 @@ class RandomNumbers:
         self.starting = False
 
     def functions(self) -> dict[str, Callable[[list], Results]]:
-        """By the names in C; the first one also by its name in Modelica, since texts leave its definition out."""
+        """The functions by their names in C; the first one also by its name in Modelica, since texts leave its
+        definition out."""
         found = {name: lambda state, name=name: self.after(name, state) for name in GENERATORS}
         library = {"Modelica.Math.Random.Generators.Xorshift64star.random": found["xorshift64star"]}
         return {f"ModelicaRandom_{name}": function for name, function in found.items()} | library

@@ -390,6 +390,7 @@ def _with_marks(residual: sympy.Expr) -> sympy.Expr:
         if parts is None or (e in in_conditions and not _is_continuous(e)):
             continue
         one, other, where = parts
+        # In the whole equation, since a factor beside a kink may vanish where it turns: q·|q| has none.
         whole: Expression = residual
         if _meet_smoothly(whole.xreplace({e: one}) - whole.xreplace({e: other}), where):
             marks[e] = Smooth(e)

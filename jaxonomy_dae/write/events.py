@@ -188,6 +188,8 @@ def guard_of(condition: Condition, where: str) -> sympy.Expr:
         return sympy.Piecewise((-1, condition), (1, True))
     if isinstance(condition, sympy.And | sympy.Or):
         # Relations in discrete variables alone switch the guard of the others on or off.
+        # Of `and` the guard falls when the last condition becomes true, of `or` when the first one does: the largest
+        # and the least of their guards.
         fixed = [c for c in condition.args if _is_discrete(c)]
         others = [guard_of(c, where) for c in condition.args if not _is_discrete(c)]
         if isinstance(condition, sympy.And):

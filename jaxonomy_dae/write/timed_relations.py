@@ -49,6 +49,8 @@ def edges_of(relation: Condition) -> Edges | None:
         if frequency is None:
             return None
         crosses = sympy.And(level > -1, level < 1)
+        # A level that is not reached has no arcsine. The clocks are there all the same, since parameters may change
+        # that, and `turns` keeps them silent.
         first = sympy.asin(_where(crosses, level))
         period, places = 2 * sympy.pi, ((first, 1), (sympy.pi - first, -1))
     else:

@@ -152,3 +152,21 @@ def test_whether_a_value_is_known_is_asked_in_one_place():
         if isinstance(node, ast.ImportFrom) and node.module == "jax.core" and "Tracer" in {a.name for a in node.names}
     ]
     assert not asking
+
+
+def test_structure_is_found_without_jax():
+    """Analysis of structure, passes and diagnoses are plain Python, NumPy and SciPy: nothing is traced there."""
+    plain = {"graph/units", "graph/structure", "graph/judgement", "compile/passes", "compile/diagnosis"}
+    found = [
+        f"{'/'.join(name)} imports {module}"
+        for name, tree in modules().items()
+        if room(name) in plain
+        for node in ast.walk(tree)
+        for module in (
+            [a.name for a in node.names] if isinstance(node, ast.Import)
+            else [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level
+            else []
+        )
+        if module.split(".")[0] in ("jax", "equinox", "diffrax", "lineax", "optimistix", "optax")
+    ]  # fmt: skip
+    assert not found

@@ -55,6 +55,7 @@ def balances(flat: FlatModel, components: Iterable[str]) -> list[Balance]:
     for name, written in found.items():
         own = v.owner == number[name]
         ports = flat.ports.owner == number[name]
+        # What children owe and what connections inside give cannot be counted from outside.
         if name in within or flat.ports.has_inside[ports].any():
             continue
         hidden = int((own & v.is_internal).sum())  # what events compute: a variable and an equation each

@@ -62,6 +62,7 @@ class Explainer:
             np.add.at(matrix[i], np.searchsorted(variables, self.entries.variable[inside]), drawn)
         u, singular, _ = np.linalg.svd(matrix, full_matrices=True)
         rank = int((singular > RANK).sum())
+        # With several null vectors, the one that the decomposition returns mixes unrelated equations.
         if rank != len(rows) - 1:
             return rows, variables
         rows = rows[np.abs(u[:, -1]) > NO_PART]

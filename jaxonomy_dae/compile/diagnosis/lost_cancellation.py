@@ -12,7 +12,9 @@ from ..model.opaque import Networks
 from ..model.tables import EquationGroup
 from .wording import some
 
-POINTS = (0.7, -1.3, 0.2)  # of all quantities: an equation that has no value at any of them is one that asks for others
+# Values of all quantities at which an equation is tried. One that has a value at none of them asks for other
+# parameters.
+POINTS = (0.7, -1.3, 0.2)
 
 
 @np.errstate(all="ignore")

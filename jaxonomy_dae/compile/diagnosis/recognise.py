@@ -59,6 +59,8 @@ def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTa
         kind = say.kind(rows, variables)
         if kind == "mixed":
             equations.append((rows, variables))
+        # Where a network floats, its equations of flows depend on each other. That is the same fault, which has a
+        # sentence.
         elif kind == "across" or not set(say.components(rows)) <= afloat:
             seen = too_often.setdefault((kind, *say.where(rows, variables)), [rows, variables, kind, []])
             seen[3].append(say.quantity(variables))
@@ -76,7 +78,8 @@ def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTa
 
 
 def _known(entries: Entries, n_variables: int) -> tuple[np.ndarray, list[int]]:
-    """For each variable, the equation that determines it alone (−1: none); and equations all of whose are known."""
+    """For each variable, the equation that determines it alone (−1: none); and the equations all of whose variables are
+    known."""
     count = np.bincount(entries.row, minlength=entries.n_rows)
     total = np.bincount(entries.row, np.arange(len(entries.row), dtype=float), entries.n_rows)
     determined_by = np.full(n_variables, -1, np.int64)
@@ -88,9 +91,12 @@ def _known(entries: Entries, n_variables: int) -> tuple[np.ndarray, list[int]]:
     by_variable = np.argsort(entries.variable, kind="stable").data
     start = np.append(0, np.cumsum(np.bincount(entries.variable, minlength=n_variables))).data
     row_of, variable_of, order_of = entries.row.data, entries.variable.data, entries.order.data
+    # Once an equation has one unknown entry left, the sum of the numbers of its unknown entries is that entry: it need
+    # not be searched for.
     left, last = count.data, np.rint(total).astype(np.int64).data  # the sum of the numbers of unknown entries
     while queue:
         row = queue.popleft()
+        # An equation that is left with dx/dt determines x but for a constant.
         if left[row] != 1 or order_of[last[row]] != 0:
             continue
         variable = variable_of[last[row]]

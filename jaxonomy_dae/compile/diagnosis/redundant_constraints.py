@@ -133,7 +133,8 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
         return []
     if sampled is None or len(rows) <= DECOMPOSED_UPTO:
         rank = rank_of(matrix.toarray(), bounds.toarray())
-        # Where it is constant, no point that is found decides.
+        # A constant Jacobian has all digits of its entries. Any other one is taken at a point that is known to half of
+        # the digits, and singular values of rows that depend on each other are no smaller.
         number = rank.number if entries.constant.all() else int((rank.s > HALF_OF_THE_DIGITS * rank.s[0]).sum())
         row_scale, column_scale, left, right = rank.r, rank.c, rank.u[:, number:], rank.vt[number:].T
         right = right if sampled is None else sampled.right / column_scale[:, None]
@@ -185,8 +186,8 @@ class _Sampled(NamedTuple):
 def _sampled(
     at: ModelAt, entries: ConstraintEntries, rows: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, _Sampled]:
-    """Of a large part: the constraints that some combination u with uᵀG = 0 contains, and these combinations. They are
-    what least squares leave of random vectors: as many as it takes until one more of them tells nothing new."""
+    """The constraints of a large part that some combination u with uᵀG = 0 contains, and these combinations. They are
+    what least squares leave of random vectors. Vectors are added until one more of them tells nothing new."""
     place = (np.searchsorted(rows, entries.row), np.searchsorted(columns, entries.column))
     shape = len(rows), len(columns)
     values, errors = (sp.csr_array((v, place), shape=shape) for v in _values_and_errors(at, entries))
@@ -344,7 +345,8 @@ def behind(flat: FlatModel, alias: AliasTable, equations: Sequence[Provenance]) 
 
 
 def _named(flat: FlatModel, names: set[str]) -> tuple[str, ...]:
-    """In the order of the model, without what only holds, and parts of one component under its name."""
+    """The components in the order of the model, without those that only hold others, and with the parts of one
+    component under its name."""
     components = [c for c in flat.components if c in names]
     return _composites([c for c in components if not _only_holds(flat, c)] or components)
 

@@ -42,6 +42,8 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
     for v in fixed[special].tolist():
         name, start = table.names[v], table.start[v]
         assert start is not None
+        # Two numbers contradict each other whatever else holds. What depends on parameters may agree, and is left to
+        # the start.
         number = None if start.parameters else float(values[v])
         key, factor = (int(alias.root[v]), int(alias.order[v])), float(alias.factor[v])
         if key[0] == ZERO:
@@ -141,6 +143,7 @@ def dependent_starts(model: ReducedModel) -> tuple[str, ...]:
     decomposition is over-determined.
     """
     flat, extended, quantities = model.flat, model.extended, model.extended.quantities
+    # One start for each quantity: those of aliases have been compared before.
     pins: dict[int, int] = {}
     for v in np.flatnonzero(flat.variables.fixed).tolist():
         q, _ = model.variables[v]

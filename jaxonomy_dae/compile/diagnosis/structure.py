@@ -36,6 +36,7 @@ def check_structure(
     incidence `pattern`; `matching` gives some of the equations an unknown each, perhaps all. After the check, every
     equation can be matched with an unknown of its own.
     """
+    # Faults that have a name first: the decomposition finds them, too, but can only list equations and variables.
     found = recognise(flat, groups, alias)
     if found.texts:
         raise StructuralError(_joined(found.texts, found.more))

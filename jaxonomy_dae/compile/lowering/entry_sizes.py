@@ -52,6 +52,7 @@ class EntrySizes:
         chosen = self.extended.groups[group]
         if chosen.template.opaque is not None:
             return np.ones(chosen.quantity.shape)
+        # `fmax` takes the number where one of the points gives none.
         size = np.fmax(*(np.abs(chosen.partials(point)) for point in self.points))
         largest = np.where(np.isfinite(size), size, 0.0).max(axis=1, keepdims=True, initial=0.0)
         return np.where(np.isfinite(size), size, np.where(largest > 0, largest, 1.0))

@@ -19,7 +19,9 @@ Chunk = Any  # an array of shape (n,), a scalar, or a tuple of scalars
 
 
 FEW = 256  # entries that are read as scalars together
-GATHER = 2  # operations that a gather takes: instead, values may come in so many pieces more than there are arrays
+# A gather takes so many operations beside one for each array that it reads. Values that come in no more pieces than
+# that are sliced and joined instead.
+GATHER = 2
 SCALARS = 32  # up to this many states, or inputs, tracing is done on scalars
 
 
@@ -40,6 +42,7 @@ def take(array: Numeric, index: np.ndarray) -> Numeric:
     if n == array.shape[0] and index[0] == 0 and np.array_equal(index, np.arange(n)):
         return array
     if n > 1:
+        # A slice is cheaper than a gather, and its transpose is a pad rather than a scatter.
         step = int(index[1] - index[0])
         if step > 0 and np.array_equal(index, index[0] + step * np.arange(n)):
             return jax.lax.slice(array, (int(index[0]),), (int(index[-1]) + 1,), (step,))
@@ -87,6 +90,7 @@ class Gather:
     def _from_several(self, chunks: list[Chunk], dtype) -> Numeric:
         breaks = np.flatnonzero((np.diff(self.chunk) != 0) | (np.diff(self.offset) != 1)) + 1
         used = distinct(self.chunk)
+        # Values that come in few runs are sliced and joined. Concatenating all sources first costs their whole length.
         if len(breaks) < len(used) + GATHER:
             runs = np.split(np.arange(len(self.chunk)), breaks)
             return joined([self._run(chunks, run, dtype) for run in runs])

@@ -105,6 +105,8 @@ def _in_nonlinear_blocks(step: AnyStep, relations: np.ndarray) -> list[StepEquat
     for equation in step.equations:
         columns = tuple(np.flatnonzero(np.isin(equation.parameter, relations).any(axis=0)).tolist())
         known.append(_with_known(equation.template, columns))
+    # With its relations known an equation reads less: a block of the plan may fall apart into smaller ones, of which
+    # some are linear.
     both = list(zip(step.equations, known, strict=True))
     blocks = _blocks(both, len(step.unknown)) if isinstance(step, Step) else None
     if blocks is None:

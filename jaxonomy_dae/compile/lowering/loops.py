@@ -53,9 +53,13 @@ def find_loops(steps: Sequence[AnyStep], n_quantities: int) -> list[AnyStep | Lo
     k = 0
     while k < n:
         found = None
+        # The shortest period first: a repetition of two links is also one of four, with a body twice as long to
+        # compile.
         for period, run in enumerate(runs, start=1):
             count = 1 + int(run[k]) // period if k < len(run) else 1
             if count >= LEAST:
+                # A run of equal shapes need not be one of equal reads. To look at all of it for each period would take
+                # quadratic time on a chain in which none fits.
                 found = _loop(steps, k, period, min(count, TRIAL), source)
                 if found is not None and count > TRIAL:
                     found = _loop(steps, k, period, count, source)
@@ -68,6 +72,7 @@ def find_loops(steps: Sequence[AnyStep], n_quantities: int) -> list[AnyStep | Lo
 
 def _shape(step: AnyStep, number: int) -> tuple:
     """A key that is equal for steps that are repetitions of each other."""
+    # Unknowns that are carried lie in the state array, each at a place of its own, and whole systems are loops already.
     if not isinstance(step, Step) or step.carried:
         return (number,)
     return (
@@ -104,6 +109,8 @@ def _loop(steps: Sequence[AnyStep], start: int, period: int, count: int, source:
     follows[1:] = (where[1:, :, 0] - where[:-1, :, 0] == period) & (where[1:, :, 1:] == where[:-1, :, 1:]).all(axis=2)
     follows = np.logical_and.accumulate(follows, axis=0) & (where[0, :, 0] >= 0) & (back <= BACK)
     known = np.logical_and.accumulate(where[:, :, 0] < start, axis=0)
+    # Every read must either move along with the repetitions or have been known before the run: an array of inputs of
+    # the scan holds those.
     holds = (follows | known).all(axis=1)
     count = count if holds.all() else int(np.argmin(holds))
     if count < LEAST:

@@ -42,6 +42,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
 
     nonlinear = [s for s in steps if s.carried]
     residual_needs = np.concatenate([np.zeros(0, np.int64), *(s.needs() for s in nonlinear)])
+    # Residuals of nonlinear blocks are evaluated in every iteration of Newton's method, and need a part of the steps.
     upstream = needed(steps, residual_needs, n)
     keep = {id(s) for s in (*upstream, *nonlinear)}
     for_residuals = [s for s in steps if id(s) in keep]
@@ -74,6 +75,8 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
 
     in_state = np.concatenate([state_order, carried])
     waves = plan_waves(needed(steps, np.concatenate([following, rates, constraint_slots, *watched]), n))
+    # Values and networks are no part of a plan: a plan with other numbers must be equal to this one, and share its
+    # programs.
     structure = dataclasses.replace(reduced, flat=dataclasses.replace(flat, declared=None))
     return SystemPlan(
         model=structure,
@@ -163,6 +166,8 @@ def _constraints(extended: Extended, selection: StateSelection, states: np.ndarr
             if pattern is not None and all(q in position for q in used):
                 pattern.append(frozenset(position[q] for q in used))
             else:
+                # A constraint that reads more than states needs the whole field's dependencies, so nothing is said of
+                # any of them.
                 pattern = None
     joined = np.concatenate(slots) if slots else np.zeros(0, np.int64)
     return groups, joined, None if pattern is None else tuple(pattern)

@@ -51,6 +51,7 @@ def _merged(run: Sequence[Step], n_quantities: int, without_package: int) -> lis
     for step in run:
         own = np.concatenate(step.unknown)
         inside[own] = True
+        # A product of two unknowns of the system is not linear: the system ends before it.
         if current and not all(_is_affine(e, inside) for e in step.equations):
             flush()
             inside[own] = True

@@ -48,6 +48,7 @@ class ColumnSets:
         """The lengths of some rows, and their columns one row after the other; at most so many."""
         start = self.pointer[rows]
         length = self.pointer[rows + 1] - start
+        # Before the columns are gathered: rows that are dense would take the memory that the limit is there to save.
         if int(length.sum()) > most:
             raise TooDense
         first = np.cumsum(length) - length
@@ -69,6 +70,7 @@ class Dependencies:
         self.segments: list[ColumnSets] = []
         self.entries = 0
         self.residuals: list[ColumnSets] = []  # of nonlinear blocks, in the order of the algebraic unknowns
+        # Segment 0, where row k is the set of k alone: what is read from the state array refers to it.
         single = ColumnSets(np.arange(self.width + 1), np.arange(self.width, dtype=np.int32))
         self._store(single, [plan.states])
 
@@ -96,6 +98,7 @@ class Dependencies:
             owners.append(np.arange(n))
         if not columns:
             return ColumnSets(np.zeros(n + 1, np.int64), np.zeros(0, np.int32))
+        # As single integers, which are sorted faster than pairs.
         key = distinct(np.concatenate(owners) * np.int64(self.width) + np.concatenate(columns))
         counts = np.bincount(key // self.width, minlength=n)
         return ColumnSets(np.concatenate([[0], np.cumsum(counts)]), (key % self.width).astype(np.int32))

@@ -274,6 +274,7 @@ class SystemPlan:
         return owner
 
     @functools.cached_property
+    # No field, since programs follow from the others, and equal plans may have been asked for different ones.
     def _programs(self) -> dict[bytes, Program]:
         return {}
 

@@ -94,6 +94,7 @@ def plan_events(
                 f"state: the equations determine it at every instant. The states are {shown or 'none'}"
             )
         place[row], factor[row] = position[quantity], scale
+        # Two variables may be aliases of one state. Which value counted would be decided by the order of the actions.
         other = begun.setdefault((event, position[quantity]), v)
         if other != v:
             raise ModelError(
@@ -189,6 +190,8 @@ class _Behind:
     """What the steps read to determine each quantity; a quantity is looked into when it is first asked for."""
 
     def __init__(self, steps: Sequence[AnyStep], n: int):
+        # Each event walks through what it reads alone. When every event looked at all others, the time grew with their
+        # square: 1.2 s for 4,000 bouncing balls, 4.6 s for 8,000.
         self._steps, self._step, self._row = steps, np.full(n, -1), np.zeros(n, np.int64)
         for k, step in enumerate(steps):
             for unknown in step.unknown:
@@ -202,6 +205,8 @@ class _Behind:
         while waiting:
             q = waiting.pop()
             k = int(self._step[q])
+            # Of blocks that are written out only the instance that is asked for is followed. A whole system couples all
+            # it has.
             row = int(self._row[q]) if k >= 0 and isinstance(self._steps[k], Step) else -1
             if k < 0 or (k, row) in done:
                 continue

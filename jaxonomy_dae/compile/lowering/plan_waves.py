@@ -96,6 +96,7 @@ def _weight(graph: Node, argument: Node, constant: set[Hashable]) -> Node | None
             known[n] = leaf(WAVE) if is_wave else n if same else rebuilt(n, inside)
         slope = partial_derivative(known[graph], WAVE)
         moving = sorted(slope.leaves - constant, key=repr)
+        # Squares, which cannot cancel each other.
         squares.append(power(substitute(slope, {v: _some(k) for k, v in enumerate(moving)}), number(2)))
     return linear([(1, square) for square in squares])
 

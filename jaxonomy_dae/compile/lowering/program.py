@@ -39,6 +39,7 @@ class Layout:
         chunk[~zero], offset[~zero] = self.chunk[quantity[~zero]], self.offset[quantity[~zero]]
         if (chunk == -2).any():
             raise AssertionError("a quantity is read before it is computed")
+        # Zero is read as such, whatever the factor. A factor of one for all lets it be left out.
         factor = np.where(factor == 0, 1.0, factor)
         return [Gather(*row) for row in zip(chunk, offset, factor, strict=True)]
 
@@ -100,7 +101,7 @@ class PlannedLoop:
 
     @property
     def equations(self) -> list[PlannedEquation]:
-        """Those of the first repetition."""
+        """The equations of the first repetition."""
         return [equation for step in self.body for equation in step.equations]
 
 
@@ -138,6 +139,7 @@ def plan(
     place[carried] = len(states) + np.arange(len(carried))
     next_chunk = 2
     planned = []
+    # Loops are found first: of a chain that has become one sparse system, repetitions can no longer be seen.
     for step in merge_thin(find_loops(steps, n_quantities), n_quantities, DENSE_UPTO):
         layout = Layout(chunk, offset)
         if isinstance(step, Loop):
@@ -145,6 +147,7 @@ def plan(
             unknown = [quantities.ravel() for each in step.unknown for quantities in each]
         elif isinstance(step, SparseStep):
             unknown = step.unknown
+            # Before it is planned, since its equations read its own unknowns as a chunk.
             chunk[unknown[0]], offset[unknown[0]] = next_chunk, np.arange(step.n)
             planned.append(_plan_sparse(step, layout, place, linear_solver))
         else:
@@ -172,6 +175,7 @@ def _plan_loop(loop: Loop, layout: Layout) -> PlannedLoop:
     for p, step in enumerate(loop.body):
         for u in range(len(step.unknown)):
             chunk_of[p, u] = 2 + len(chunk_of)
+    # A scan hands on values of the last repetition only.
     # A register holds a value of `back` repetitions ago; it is filled from the register of one less.
     registers: dict[tuple[int, int, int, int], int] = {}
     first: list[int] = []

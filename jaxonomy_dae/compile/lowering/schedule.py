@@ -259,10 +259,14 @@ def build_schedule(extended: Extended, blocks: Blocks, entry_sizes: EntrySizes) 
         here = places[group_of[blocks.equations[places]] == g]
         if len(here):
             keyed.extend(_single_steps(group, g, row_of, blocks, here, block_of_place))
+    # Blocks of one shape share a step, and so one traced program, however many there are: a program grows with the
+    # number of shapes.
     shapes: dict[tuple, list[_Block]] = {}
     for b in np.flatnonzero(sizes > 1).tolist():
         block = _block(extended, blocks, b, group_of, row_of)
         shapes.setdefault((int(blocks.level[b]), block.shape), []).append(block)
+    # Linear and nonlinear blocks stay apart: unknowns of a nonlinear one lie in the state array, and need not of the
+    # other.
     large: dict[tuple[int, bool], list[_Block]] = {}
     for (level, shape), alike in shapes.items():
         linear = all(extended.groups[g].template.is_affine_in(_inside(slots)) for g, slots in shape)
@@ -284,6 +288,8 @@ def _single_steps(group: ExtendedGroup, g: int, row_of, blocks: Blocks, places, 
     unknown = blocks.unknowns[places]
     level = blocks.level[block_of_place[places]]
     hit = group.quantity[rows] == unknown[:, None]
+    # Where the unknown stands may differ from instance to instance: a resistor is solved for its current here and for
+    # its voltage there.
     for members in equal_rows([level, *np.packbits(hit, axis=1).T]):
         r, lv = rows[members], int(level[members[0]])
         positions = np.flatnonzero(hit[members[0]])
@@ -316,6 +322,7 @@ def _inside(slots: tuple[int, ...]) -> list[int]:
 
 def _block(extended: Extended, blocks: Blocks, b: int, group_of: np.ndarray, row_of: np.ndarray) -> _Block:
     inside = slice(int(blocks.pointer[b]), int(blocks.pointer[b + 1]))
+    # In the order of their templates, so that blocks that differ in the order of declaration alone have one shape.
     equations = sorted(blocks.equations[inside].tolist(), key=lambda e: (int(group_of[e]), e))
     unknowns = sorted(blocks.unknowns[inside].tolist())
     local = {q: u for u, q in enumerate(unknowns)}
@@ -349,6 +356,8 @@ def _torn_step(
         safe = set()
         for u in contains[-1]:
             where = [k for k in inside if slots[k] == u]
+            # An unknown in two slots has the sum of two coefficients, which may cancel. What may vanish while the model
+            # runs must not become a divisor.
             if len(where) == 1 and not entry_sizes.may_vanish(g, where[0], rows):
                 safe.add(u)
         solvable.append(frozenset(safe))

@@ -54,10 +54,14 @@ def consistent_point(extended: Extended, guess: Point, fixed: list[tuple[int, fl
         r, jacobian = residual_and_jacobian(extended, at)
         r = np.concatenate([r, at.values[pins] - targets])
         full: sp.csr_array = sp.vstack([jacobian, pin_rows]).tocsr()[:, :n]
+        # Residuals are compared in the units of the last accepted point: units of the trial point would change what is
+        # measured along the way. The decrease that is asked for is that of Armijo (1966).
         falls = np.isfinite(r).all() & (np.linalg.norm(rows * r) < (1 - 1e-4 * part) * least)
         worse, nowhere = ~falls & (least < np.inf), np.full(n, np.nan)
         if worse or not np.isfinite(full.data).all():
             return Tried(falls, np.False_, nowhere, (rows, least))
+        # The step of least norm depends on units. In equilibrated ones, no variable moves more than another for its
+        # unit alone.
         scaled, rows, columns = equilibrated(full)
         size = np.linalg.norm(rows * r)
         holds = size <= 1e-15 * (1 + np.abs(x / columns).max(initial=0.0))

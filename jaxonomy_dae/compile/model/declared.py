@@ -42,6 +42,7 @@ def leading_starts(model: ReducedModel, parameters: np.ndarray) -> Int[np.ndarra
     flat, variables = model.flat, model.variables
     v = np.flatnonzero(flat.variables.start.is_given & (variables.quantity >= 0))
     value = flat.variables.start.values(parameters)[v] / variables.factor[v]
+    # The last entry of a quantity wins below, so the keys ascend.
     order = np.lexsort((-v, value, np.abs(value), flat.variables.fixed[v]))
     last = np.full(int(variables.quantity.max(initial=-1)) + 1, -1)
     last[variables.quantity[v[order]]] = v[order]

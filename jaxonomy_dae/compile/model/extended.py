@@ -69,6 +69,7 @@ class Extended:
             n, k = group.quantity.shape
             row, column = np.repeat(group.equation, k), group.quantity.ravel()
             used = column != ZERO
+            # ZERO is −1 and would read the last entry.
             used[used] = wanted[column[used]]
             rows.append(row[used])
             columns.append(column[used])

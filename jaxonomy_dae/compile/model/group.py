@@ -29,6 +29,7 @@ class Columns:
 
     def take(self: C, rows: Rows) -> C:
         """The record of these rows."""
+        # Columns of a large model are not copied for nothing.
         if isinstance(rows, np.ndarray) and rows.dtype == bool and rows.all():
             return self
         columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
@@ -113,6 +114,8 @@ class QuantityGroup(Group):
     @np.errstate(all="ignore")
     def residual(self, at: Point) -> Float[np.ndarray, " n"]:
         """The residuals."""
+        # A sum of columns one by one takes Python's time for each term. `np.sum` would add in pairs: other roundings
+        # than those of the short equations.
         if isinstance(self.template, LinearTemplate) and self.factor.shape[1] > MANY:  # from the first term to the last
             return np.cumsum(self.coefficient * (self.factor * at.values[self.quantity]), axis=1)[:, -1]
         out = self.template.residual(*self._arguments(at), backend="numpy")
@@ -144,6 +147,8 @@ class QuantityGroup(Group):
             slots = [there[place[s]] if s in place else moved[place[s[0], s[1] - 1]] for s in derivative.slots]
             return derivative.partial_values(slots, *others, backend="numpy")
 
+        # The derivative of the template is affine in the slots that are new in it, so one difference gives all that
+        # moves with them.
         moving = partials(self.slots(move))
         still = partials([np.zeros(len(self))] * len(there))  # what changes with time alone
         out = np.zeros(self.factor.shape)

@@ -99,6 +99,7 @@ class _Walk:
             case dict():
                 return self._all(name, [*part, *part.values()])
             case set() | frozenset():
+                # The order of a set depends on the hash seed of the process.
                 return _digest(name, *sorted(map(self.digest, part)))
             case enum.Enum():
                 return _digest(name, repr(part.value).encode())
@@ -106,6 +107,7 @@ class _Walk:
                 return _digest("type", self._class(part))
             case Node():
                 return _digest(name, part.digest)
+            # The key leaves functions out, which have no text that identifies them.
             case AbstractTemplate():
                 return _digest(name, part.key.encode(), self.digest(part.opaque))
             case Lines():
@@ -125,6 +127,8 @@ class _Walk:
         if dataclasses.is_dataclass(part) and not callable(part):
             return self._all(name, [type(part), *_attributes(part)])
         if callable(part):
+            # A function counts by when it is met: two models that use one function twice, or two functions once,
+            # differ.
             return _digest("function", self._number(part), getattr(part, "__qualname__", name).encode())
         raise TypeError(f"it is not known what makes two objects of type {type(part)} equal")
 
@@ -157,6 +161,7 @@ def _attributes(part: object) -> list[object]:
 def _digest(kind: str, *parts: Any) -> bytes:
     found = hashlib.sha256(kind.encode())
     for part in parts:
+        # Without lengths, parts ("ab", "c") and ("a", "bc") would have one digest.
         found.update(len(part).to_bytes(8, "little") if isinstance(part, bytes) else b"")
         found.update(part)
     return found.digest()

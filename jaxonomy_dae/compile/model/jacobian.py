@@ -51,6 +51,7 @@ def generic_jacobian(
     - `size`: of every quantity; the factor counts. `parameter_size`: of every parameter.
     """
     rng = np.random.default_rng(0)
+    # The seed is fixed, so that a verdict on a model is the same in each process.
     values = [(size * generic(rng, size.shape), parameter_size * generic(rng, parameter_size.shape)) for _ in range(2)]
     samples = [Point.of(*numbers, 0.5) for numbers in values]
     partials, errors = [], []

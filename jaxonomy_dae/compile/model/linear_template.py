@@ -49,6 +49,7 @@ class LinearTemplate(AbstractTemplate):
         return np.abs(terms.sum(axis=1)) <= NOISE * EPS * np.abs(terms).sum(axis=1)
 
     def residual(self, slots, parameters, coefficients, t, networks, backend="jax"):
+        # A product with ±1 is exact, so the result is the same.
         if backend == "numpy" and len(slots) > MANY:
             return sum(c * s for c, s in zip(coefficients, slots, strict=True))
         total = 0.0

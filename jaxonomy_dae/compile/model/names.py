@@ -108,6 +108,8 @@ class Numbers(Mapping[str, int]):
         if name in self._more:
             return self._more[name]
         owner, number = self._names.owner, self._names.paths.number
+        # Without a dictionary of all names, of which a large model has millions: a name is found by its component,
+        # whose path may have points itself.
         for before in self._before if isinstance(name, str) else ():
             inner = name.removeprefix(before)
             cut = inner.find(".") if len(inner) + len(before) == len(name) else -1

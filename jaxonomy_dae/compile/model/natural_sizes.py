@@ -79,6 +79,7 @@ def natural_sizes(
     """
     factors = Factors() if factors is None else factors
     n, n_parameters = len(size), len(parameters)
+    # Units of equations are unknowns beside sizes: an equation that is multiplied by 1e9 says the same.
     known = np.concatenate([size != 0.0, parameters != 0.0, np.zeros(n_equations, bool)])
     quantity, parameter = (np.where(given == 0.0, 1.0, given) for given in (size, parameters))
     begun = np.log10(np.abs(np.append(quantity, parameter)))
@@ -90,6 +91,7 @@ def natural_sizes(
             break
         seen = [entries, beside] + ([_seen(groups, quantity, parameter, True)] if by_terms else [])
         matrix: Any = sp.vstack([s.powers(n, n_parameters, n_equations) for s in seen], format="csr")
+        # Their columns stay, as zeros, so that the numbering does not depend on what is known.
         matrix.data[known[matrix.indices]] = 0.0
         off = np.concatenate([s.logarithm for s in seen])
         is_last = all(s.is_linear(parameters != 0.0) for s in seen)
@@ -106,6 +108,8 @@ def natural_sizes(
         found = factors.least_squares(matrix, -off)
         time += float(found[-1]) if rates is not None else 0.0
         quantity, parameter = _moved(quantity, found[:n]), _moved(parameter, found[n : n + n_parameters])
+        # 0.3 decades are a factor of two, to which typical sizes are rounded. Entries that are products of sizes are
+        # met by the first round.
         if is_last or np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3:
             break
     return quantity, parameter
@@ -188,6 +192,8 @@ def _seen(groups: Sequence[QuantityGroup], quantity: np.ndarray, parameter: np.n
         at = Point.of(quantities.ravel(), parameters.ravel(), 0.5)
         return np.abs(own.terms(at) if of_terms else own.partials(at))
 
+    # A generic point, the same in each process: at the sizes themselves, terms may cancel, as in p₁ − p₂ where both
+    # have one size.
     rng = np.random.default_rng(1)
     point, parameters = quantity * generic(rng, quantity.shape), parameter * generic(rng, parameter.shape)
     logarithms: list[np.ndarray] = [np.zeros(0)]
@@ -197,6 +203,8 @@ def _seen(groups: Sequence[QuantityGroup], quantity: np.ndarray, parameter: np.n
     for group in groups:
         if group.quantity.shape[1] == 0 or group.template.opaque is not None:
             continue
+        # A quantity that stands in several slots of an equation has a power for each: moved together, they would hide
+        # each other.
         own = group.apart()
         arguments = np.append(point, 0.0)[group.quantity], parameters[group.parameter]
         size = sizes(own, *arguments)
@@ -222,6 +230,8 @@ def _seen(groups: Sequence[QuantityGroup], quantity: np.ndarray, parameter: np.n
                 moved[side] = arguments[side].copy()
                 moved[side][:, np.unique(owner[owner >= 0])] *= 1 + STEP
                 with np.errstate(all="ignore"):
+                    # The powers are differences of logarithms rather than derivatives: second derivatives of all
+                    # templates would have to be made for some digits.
                     power = np.log(sizes(own, *moved) / size) / np.log1p(STEP)
                 moving = ids[:, owner]
                 hit = used & np.isfinite(power) & (np.abs(power) > 1e-6) & (owner >= 0) & (moving != ZERO)

@@ -42,6 +42,7 @@ class OpaqueFunction:
     def __call__(self, weights: PyTree, t, u):
         """The outputs, in the dtype of `u`; the weights are used in their own."""
         dtypes = [leaf.dtype for leaf in jax.tree.leaves(weights) if hasattr(leaf, "dtype")]
+        # The inputs are cast, not the weights: a network of single precision computes in it inside any model.
         floating = [d for d in dtypes if jnp.issubdtype(d, jnp.floating)]
         dtype = floating[0] if floating else u.dtype
         inside = u.astype(dtype)
@@ -54,6 +55,7 @@ class OpaqueFunction:
     def derivatives(self, weights, order: int, t, inputs: list[list]):
         """The `order`-th time derivative of the outputs; inputs[k] lists the non-time inputs' k-th derivatives."""
 
+        # Nested forward derivatives work for any function of JAX, and the orders are low.
         def level(k: int):
             if k == 0:
                 return lambda time, u: self(weights, time[0], u[0])
@@ -147,6 +149,7 @@ class OpaqueTemplate(AbstractTemplate):
 
     def _numpy(self, what: str, slots, t, networks) -> np.ndarray:
         if not networks.weights:  # none is known: they count as zero
+            # A plan knows no weights: they belong to the system. Structure may not depend on them.
             columns = np.stack(np.broadcast_arrays(*slots), axis=-1).astype(float)
             one_hot = np.arange(len(slots)) == 0
             return {
@@ -200,6 +203,8 @@ class Networks:
 
     def evaluate(self, opaque: OpaqueFunction, order: int, t, inputs: list[list]) -> Array:
         """The outputs' `order`-th time derivative, shape (outputs,) or (outputs, instances)."""
+        # By identity of the arguments, which are tracers and have no value: an equation for each output asks for the
+        # same evaluation.
         key = (opaque.index, order, id(t), *(id(x) for level in inputs for x in level))
         if key not in self._seen:
             value = opaque.derivatives(self.weights[opaque.index], order, t, inputs)

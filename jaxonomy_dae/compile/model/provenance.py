@@ -54,6 +54,7 @@ class Provenances(Sequence[Provenance]):
         """The provenances of a list."""
         entries = list(entries)
         written = np.array([p.is_written for p in entries], bool)
+        # The same list twice: whether a row is written by a component is told by its source.
         return cls((entries.__getitem__,) * 2, (False, True), written.astype(np.int32), np.arange(len(entries)))
 
     @classmethod

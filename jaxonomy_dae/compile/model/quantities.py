@@ -47,6 +47,7 @@ class QuantityNames(Sequence[str]):
         v = np.flatnonzero((variables.quantity >= 0) & (variables.factor == 1))
         q = variables.quantity[v]
         is_root = (order[q] == 0) & (self._quantities.variable[self._quantities.owner[q]] == v)
+        # Internal names are nobody's, and a name of a port says less than that of the part's own variable.
         sorting = np.lexsort((v, ~is_root, table.is_port[v], table.is_internal[v], q))
         named, first = np.unique(q[sorting], return_index=True)
         best = np.full(self._quantities.n, -1)

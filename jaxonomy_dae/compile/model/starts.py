@@ -62,6 +62,7 @@ class Starts(Sequence[Start | None]):
 
     def __init__(self, n: int, groups: Sequence[Formulas]):
         self.groups = tuple(groups)
+        # An object for each start would take more memory than all other tables of a large model.
         self._place = np.full((n, 2), -1, np.int32)
         for k, group in enumerate(self.groups):
             self._place[group.target] = np.stack([np.full(len(group.target), k), np.arange(len(group.target))], 1)
@@ -74,6 +75,7 @@ class Starts(Sequence[Start | None]):
     @property
     def is_number(self) -> np.ndarray:
         """True for variables that have a start which no parameter changes."""
+        # Variables without a start have the place −1, which reads the last entry.
         number = [group.parameter.shape[1] == 0 for group in self.groups]
         return np.array([*number, False], bool)[self._place[:, 0]]
 

@@ -66,6 +66,8 @@ class SymbolicTemplate(AbstractTemplate):
     def derivative(self) -> "SymbolicTemplate":
         moved = {slot_label(s): slot_label((s[0], s[1] + 1)) for s in self.slots}
         total = directional_derivative(self.graph, raised(moved, TIME_LABEL))
+        # Of the slots that may occur only those that do are kept: a slot that nothing reads would be an entry of the
+        # incidence.
         slots = sorted({*self.slots, *((b, q + 1) for b, q in self.slots)})
         used = tuple(s for s in slots if slot_label(s) in total.leaves)
         return template_of(total, used, self.n_parameters, self.n_coefficients)
@@ -82,6 +84,7 @@ class SymbolicTemplate(AbstractTemplate):
         return not self._slots_of_partials[position] and TIME_LABEL not in self.partials[position].leaves
 
     def coefficient_is_number(self, position: int) -> bool:
+        # Coefficients of instances are numbers other than zero, so a product of them is one, too.
         factor, rest = split(self.partials[position])
         bases = rest.arguments if rest.operation == "product" else () if rest is ONE else (rest,)
         return factor != 0 and all(b.operation == "leaf" and b.data in self._numbers for b in bases)
@@ -107,6 +110,7 @@ class SymbolicTemplate(AbstractTemplate):
 
     def is_unmoved(self, direction: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
         n = len(self.slots)
+        # Graphs are put together once for each distinct row: in a large model most rows are alike.
         patterns, which = np.unique(np.hstack([direction, coefficients]), axis=0, return_inverse=True)
         zero = []
         for pattern in patterns.tolist():
@@ -114,6 +118,8 @@ class SymbolicTemplate(AbstractTemplate):
             partials = [substitute(p, values) for p in self.partials] if values else self.partials
             along: dict[Node, list[float]] = {}
             for weight, partial in zip(pattern[:n], partials, strict=True):
+                # Parts that are the same function of slots and parameters are compared by their numbers. Parts that are
+                # different functions cannot cancel wherever the slots are.
                 for factor, rest in map(split, terms(partial) if weight else ()):
                     along.setdefault(rest, []).append(weight * float(factor))
             zero.append(all(abs(sum(parts)) <= NOISE * EPS * sum(map(abs, parts)) for parts in along.values()))
@@ -152,6 +158,7 @@ class SymbolicTemplate(AbstractTemplate):
 
     @functools.cached_property
     def _terms(self) -> Sequence[Node]:
+        # In a linear equation the partial derivatives times sizes are the terms already.
         is_linear = all(self.coefficient_is_number(k) for k in range(len(self.slots)))
         return [] if is_linear else terms(self.graph)
 
@@ -189,10 +196,14 @@ class SymbolicTemplate(AbstractTemplate):
 
 def _in_dtype(coefficients: Sequence[Numeric], values: Sequence[Numeric]) -> Sequence[Numeric]:
     """Coefficients that differ by instance, in the dtype of traced values."""
+    # Coefficients are of double precision. Beside traced values of single precision, strict promotion of dtypes would
+    # refuse them.
     arrays = [v for v in values if isinstance(v, jax.Array)]
     return [c if np.ndim(c) == 0 else jnp.asarray(c, arrays[0].dtype) for c in coefficients] if arrays else coefficients
 
 
+# Templates keep their kernels and derivatives. One object for equal residuals lets models that are compiled one after
+# the other share them.
 @functools.lru_cache(maxsize=4096)
 def template_of(graph: Node, slots: tuple[Slot, ...], n_parameters: int, n_coefficients: int = 0) -> SymbolicTemplate:
     """The one template of this canonical residual."""
@@ -219,5 +230,6 @@ def linear_coefficients(residual: Node, variables: Sequence[VariableSymbol]) -> 
     labels = [symbol_label(v) for v in variables]
     if start != 0 or not variables or not all(math.isfinite(c) for c in found.values()):
         return None
+    # A leaf that is not one of the variables is a parameter or the time, whose value is no number of the template.
     inside = len(found) == len(residual.arguments or (residual,)) and set(found) == set(labels)
     return tuple(found[label] for label in labels) if inside else None

@@ -106,6 +106,7 @@ class ParameterTable:
     @property
     def follow_events(self) -> tuple[Formulas, ...]:
         """The expressions that read what events assign, directly or through others."""
+        # One pass finds all of them, since a group reads only what those before it have computed.
         moved, found = self._assigned, []
         for group in self.dependents:
             rows = moved[group.parameter].any(axis=1) & ~moved[group.target]
@@ -248,6 +249,7 @@ def provenance_of(groups: Sequence[EquationGroup], equation: int) -> Provenance:
 
 def complete(dependents: Sequence[Formulas], array: Numeric) -> Numeric:
     """All parameters, shape (*batch, n), with the dependent ones computed from the others; NumPy or JAX."""
+    # In NumPy `put` changes the array that it is given.
     array = array.copy() if isinstance(array, np.ndarray) else array
     for group in dependents:
         array = group.put(array, array)

@@ -15,7 +15,8 @@ from .natural_sizes import Factors, constants, natural_sizes
 from .quantities import ReducedModel
 
 MOVED = 1e-6  # of parameters: a difference from which a slope is told to six digits
-DECADES = 30  # that they may span: single precision has 38
+# Typical sizes lie within so many decades of one: single precision has 38.
+DECADES = 30
 ROOM = 4  # answers kept for one model: at the values it was compiled with, at those it is run with, and two between
 
 
@@ -42,8 +43,9 @@ def unrounded_sizes(
 
 
 def _between(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
-    """What events assign starts at one of its values, where a branch of an equation may be zero that has a size in all
-    others: free friction says nothing of the force that friction has. Beside it, other branches count."""
+    """The parameters, with those that events assign moved a little. They start at one of their values, at which a
+    branch of an equation may be zero that has a size at all others: while friction is off, its equation says nothing of
+    the force. Beside that value, the other branches count."""
     assigned = model.flat.parameters.changed_by_events
     return np.where(assigned[: len(parameters)], parameters * (1 + MOVED), parameters)
 
@@ -55,35 +57,58 @@ def _powers_of_two(values: np.ndarray) -> np.ndarray:
     return np.sign(values) * np.exp2(exponents)
 
 
+class _Declared:
+    """What a model declares of sizes, whatever the values of its parameters."""
+
+    def __init__(self, model: ReducedModel):
+        self.flat, variables = model.flat, model.variables
+        flat = self.flat
+        self.scale = declared_scale(model)  # of quantities
+        self.started = np.flatnonzero(flat.variables.start.is_given & (variables.quantity >= 0))
+        self.quantity, self.factor = variables.quantity[self.started], variables.factor[self.started]
+        self.open = self.scale[self.quantity] == 0.0
+        self.unit = [flat.variables.unit[k] for k in self.started.tolist()]
+        # Numbers that nothing computes are not told from rounding, so their slopes need not be known.
+        self.are_numbers = bool(flat.variables.start.is_number[self.started].all())
+
+
+_DECLARED: weakref.WeakKeyDictionary[Extended, _Declared] = weakref.WeakKeyDictionary()
+
+
 def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
     """Nominal values, and else the largest starts; zero where there is none."""
-    size, starts = declared_scale(model), model.flat.variables.start
-    v = np.flatnonzero(starts.is_given & (model.variables.quantity >= 0))
-    values = starts.values(parameters)
-    # A start that is computed may be rounding alone, as L·sin(π) is; a number that is given is what it is.
-    moved = starts.values(parameters * (1 + MOVED * generic(np.random.default_rng(1), parameters.shape)))
-    values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
-    quantity, value = model.variables.quantity[v], values[v] / model.variables.factor[v]
-    tells = np.isfinite(value) & (value != 0.0) & (size[quantity] == 0.0)
-    tells &= ~_lost_beside_others(values[v], model.flat.variables.unit, v)
-    np.maximum.at(size, quantity[tells], np.abs(value[tells]))
+    declared = _DECLARED.get(model.extended)
+    if declared is None or declared.flat is not model.flat:
+        declared = _DECLARED[model.extended] = _Declared(model)
+    size, starts, started = declared.scale.copy(), model.flat.variables.start, declared.started
+    values = starts.values(parameters)[started]
+    if not declared.are_numbers:
+        # A start that is computed may be rounding alone, as L·sin(π) is; a number that is given is what it is.
+        # How a start answers to small changes of its parameters shows how large its terms are.
+        moved = starts.values(parameters * (1 + MOVED * generic(np.random.default_rng(1), parameters.shape)))[started]
+        values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
+    value = values / declared.factor
+    tells = declared.open & np.isfinite(value) & (value != 0.0) & ~_lost_beside_others(values, declared.unit)
+    np.maximum.at(size, declared.quantity[tells], np.abs(value[tells]))
     return size
 
 
-def _lost_beside_others(values: np.ndarray, units: list[str], variables: np.ndarray) -> np.ndarray:
+def _lost_beside_others(values: np.ndarray, units: list[str]) -> np.ndarray:
     """True for starts that rounding would lose beside the largest one of the same unit: an angle of 1e-16 among angles
     of 1, computed outside of the model, is zero."""
     sizes = np.where(np.isfinite(values), np.abs(values), 0.0)
     small = (sizes > 0) & (sizes <= KNOWN * sizes.max(initial=0.0))
-    lost = np.zeros(len(variables), bool)
-    for unit in {units[k] for k in variables[small].tolist()} - {""}:
-        same = np.array([units[k] == unit for k in variables.tolist()])
+    lost = np.zeros(len(values), bool)
+    # Only within one unit: a charge of 1e-18 C beside a resistance of 1e6 Ω is not a rounding error. Without units
+    # nothing can be compared.
+    for unit in {units[k] for k in np.flatnonzero(small).tolist()} - {""}:
+        same = np.array([other == unit for other in units])
         lost |= same & (sizes <= KNOWN * sizes[same].max())
     return lost
 
 
 class _Balance:
-    """What was found for a model: other values of parameters that its equations do not read change nothing."""
+    """Sizes that were found for a model. They depend on the parameters that its equations read, and on no others."""
 
     def __init__(self, extended: Extended):
         self.factors = Factors()
@@ -122,5 +147,6 @@ def _balanced(
         while len(balance.found) >= ROOM:
             balance.found.pop(next(iter(balance.found)), None)
         balance.found[key] = 10.0 ** np.clip(np.log10(np.abs(sizes)), -DECADES, DECADES)
+        # The array is handed to all who ask; one that changed it would change the sizes of all others.
         balance.found[key].flags.writeable = False
     return balance.found[key]

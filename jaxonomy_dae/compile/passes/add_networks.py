@@ -93,6 +93,7 @@ def add_corrections(
     for group in groups:
         new = physics[group.variable]
         hit = (new >= 0) & (group.order > 0)
+        # u is dv/dt already, so that d²v/dt² becomes du/dt.
         variable, order = np.where(hit, new, group.variable), np.where(hit, group.order - 1, group.order)
         redirected.append(dataclasses.replace(group, variable=variable, order=order))
     return _extended(variables, names, first), (*redirected, *joined_by_template(builder)), rows

@@ -42,6 +42,8 @@ def _zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values)
     found = []
     for g, group in enumerate(groups):
         template = group.template
+        # Numbers that are zero are no entries of the incidence. What depends on the state may vanish here and not
+        # elsewhere, which the run finds. So only coefficients that are functions of parameters are left to check.
         if not template.n_parameters or not len(group):
             continue
         equation = np.arange(first[g], first[g + 1])

@@ -104,6 +104,8 @@ def _misfits_in_components(model: ModelNumbers, units: _DeclaredUnits) -> list[s
         outside, same = by_shape.setdefault(_shape(i.component), ([], {}))
         if not same:
             outside.extend(_outside(i.component))
+        # Units of its own belong to the shape. What a component reads of its parent and of children may differ between
+        # equals.
         same.setdefault(tuple(units.of(i, label) for label in outside), []).append(i)
     read_once: dict[sympy.Expr, Node] = {}
     wrong = []

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import sympy
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 from ...base.errors import ModelError
 from ...write.declarations import EachValue, Variable
@@ -85,6 +85,8 @@ def _starts(model: ModelNumbers, started: Sequence[tuple[Variable, Instances, in
     for variable, i, k in started:
         expression = variable.start
         if expression not in read:
+            # A set of symbols has another order in each process, and templates are told apart by the places of their
+            # parameters.
             symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: int(model.parameter(i, s.path)[0]))
             graph = read_expression(expression, model.path(i))
             read[expression] = canonical(graph, (), symbols), [s.path for s in symbols]
@@ -170,6 +172,7 @@ def _dependent_parameters(
     known_templates: dict[sympy.Expr, SymbolicTemplate] = {}
     left = dict(reads)
     while left:
+        # By levels, so that all of one template at a level are computed at once.
         ready = [p for p, (_, ids) in left.items() if not any(i in left for i in ids)]
         if not ready:
             p = next(iter(left))

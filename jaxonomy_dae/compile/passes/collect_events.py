@@ -25,6 +25,7 @@ def event_table(model: ModelNumbers) -> EventTable:
     left_alone = _left_alone(model)
     if not found:
         return EventTable(left_alone=left_alone)
+    # Sampled events come first: tables of events are cut at `n_clocks`.
     found.sort(key=lambda entry: (entry[4].clock is None, entry[0], entry[1]))
     place = {int(p): i for i, p in enumerate(model.discrete)}
     variables, parameters = functools.cache(model.variable), functools.cache(model.parameter)
@@ -36,6 +37,7 @@ def event_table(model: ModelNumbers) -> EventTable:
         return int(parameters(i, path)[row])
 
     def in_parameters(i: Instances, row: int, expression: sympy.Expr) -> Start:
+        # A set of symbols has another order in each process.
         symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: parameter(i, s.path, row))
         graph = read_expression(expression, model.paths[i.number[row]])
         return Start(canonical(graph, (), symbols), tuple(parameter(i, s.path, row) for s in symbols))

@@ -57,6 +57,7 @@ def quantity_label(variable: int, order: int) -> Hashable:
 
 def somewhere(variable: np.ndarray | int, order: np.ndarray | int, trial: int) -> np.ndarray:
     """Numbers in ±(0.5, 1.5) without pattern, always the same for the same quantity and trial."""
+    # Not a random generator: a sample belongs to its quantity and trial, whatever was drawn before.
     x = np.sin(12.9898 * (np.asarray(variable) + 1) + 78.233 * (np.asarray(order) + 1) + 37.719 * trial) * 43758.5453
     x = 0.5 + x - np.floor(x)
     return x if trial % 2 else -x
@@ -73,6 +74,7 @@ def near(values: np.ndarray, trial: int, kept: np.ndarray) -> np.ndarray:
     variables, stay as given: they say which branch holds."""
     if trial == 0:
         return values
+    # Signs are kept, because equations may have no value beyond them, as roots and logarithms.
     factor = 0.25 + np.abs(somewhere(np.arange(len(values)), 3, trial))
     moved = np.where(values == 0, factor, values * factor)
     moved[kept] = values[kept]
@@ -118,6 +120,8 @@ class Samples:
         best, most = [], -1
         for k in range(NEARER + 1):
             factor = 0.1 ** max(k - 1, 0)
+            # Sizes of order one first, then natural sizes, then nearer and nearer to zero: exponentials of volts over
+            # thermal volts overflow at one, and have values at natural sizes.
             unit = [factor * sizes.get(label, 1.0) for label in labels]
             self._columns = [
                 np.array([self._value(label, p, u) for p in range(3 * POINTS)])
@@ -128,6 +132,8 @@ class Samples:
                 best, most = self._columns, with_values
             if with_values == 3 * POINTS:
                 break
+            # Natural sizes take least squares over the equations, so they are asked for only if the first points do not
+            # do.
             sizes = sizes or natural()
         self._columns = best
 
@@ -181,6 +187,8 @@ def combine(
     quantities = sorted(
         (label for label in frozenset().union(*(e.leaves for e in equations)) if label[0] == "quantity"), key=repr
     )
+    # Cancellation is looked for term by term. At sample points near one, 1e-6·x³ beside 1e6·x − 1e6·x is nothing,
+    # though it is as large as other terms at x = 1,000.
     without = _sum_of_terms(terms)
     samples = Samples([*equations, *weights], values, kept, natural)
     occurs: dict[Hashable, list[tuple[Node, Node]]] = {}
@@ -193,6 +201,8 @@ def combine(
         slopes = samples([multiply(w, partial_derivative(e, label)) for w, e in inside])
         finite = np.isfinite(slopes).all(axis=0)
         size = np.abs(slopes).sum(axis=0)
+        # Only a first sieve, with the errors of weights that were computed in it. What passes must vanish term by term,
+        # or be rounding wherever it has a value.
         small = np.abs(slopes.sum(axis=0)) <= CANCELLED * size
         # Where there are values at some points only, slopes of zero may be what underflowed.
         seen = finite.all() or (size[finite] > 0).any()
@@ -201,13 +211,17 @@ def combine(
             if label in without.leaves and label not in gone:
                 left = _sum_of_terms([partial_derivative(without, label)])
             # An expression that is zero on one branch need not be zero on another.
+            # The sample points may all lie on one branch: Min(p, 1e4) − p is zero at each of them.
             if number(left) == 0 or (not has_branches(left) and samples.is_rounding(left)):
                 cancelled.append(label)
             else:
                 stays = True
     total = without if stays else total
+    # The highest derivatives must go, or index reduction would meet the same block again and again.
     if not set(gone) <= set(cancelled) | (set(gone) - set(quantities)):
         return None
+    # The last proof is by values: the combination without the quantities must be the sum of the weighted equations. A
+    # quantity is put in as 0, 1 or 0.7, because one of these may be a pole or make an expression vanish.
     before = samples(terms)
     for value in (0, 1, 0.7):
         chosen = {label: constant(value) for label in cancelled}
@@ -245,6 +259,7 @@ def _guarded(graph: Node, slopes: Sequence[Sequence[Node]]) -> Node | None:
         if number(left) == 0:
             continue
         size = linear((1, apply("abs", term)) for term in terms)
+        # Rounding leaves far less than this of terms that cancel, and another branch far more.
         holds.append(compare("less_equal", apply("abs", left), scale(SLIGHT, size)))
         if any(label[0] == "quantity" and label not in graph.leaves for label in left.leaves | size.leaves):
             return None

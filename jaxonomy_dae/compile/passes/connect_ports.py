@@ -71,6 +71,8 @@ def connect_ports(model: ModelNumbers, diagram: AcausalDiagram, builder: list[Eq
     """
     ports = _list_ports(model)
     left, right = _joined_faces(model, diagram, ports)
+    # With one face, a port that is connected inside and outside would join both sets into one, and flows would pass by
+    # the component that owns it.
     n = 2 * model.n_ports
     graph = sp.coo_array((np.ones(len(left)), (left, right)), shape=(n, n))
     _, part = connected_components(graph, directed=False)
@@ -228,6 +230,8 @@ def _add_equations(
         all_later = np.flatnonzero(inside & (np.arange(len(face)) > start[:-1][junction]))
         for k in range(n_across):
             of_tree = domain.overdetermined is not None and domain.across[k][0] in domain.overdetermined.names
+            # Each of the later ports equals the first: n − 1 equations for n ports, whatever pairs the user has
+            # connected. Pairs as written would repeat themselves where connections form a loop.
             later = all_later[tree[all_later]] if of_tree else all_later
             set_ = junction[later]
             variable = ports.variable[np.stack([port[start[:-1][set_]], port[later]], axis=1), k]
@@ -247,6 +251,8 @@ def _add_equations(
                 enters = ports.variable[port[members], column + len(domain.streams)]
                 within = face[members] % 2 == 1  # seen from inside, what enters the component leaves its port
                 leaves, enters = np.where(within, enters, leaves), np.where(within, leaves, enters)
+                # Of two ports, what enters one leaves the other, without a mixture. The equation is linear, so that
+                # alias elimination removes it, and no small flow has to be bridged.
                 if length <= 2:
                     variable = np.stack([enters, leaves[:, ::-1]], axis=2).reshape(-1, 2)
                     place = np.tile(column * length + np.arange(length), len(sets))
@@ -259,6 +265,8 @@ def _add_equations(
                     curved += _mixtures(ports.nominal[port[members]], flows, sign[members], leaves, enters, provenance)
         if domain.overdetermined is not None:
             curved += _closed_loops(ports, domain, face, junction, start, all_later[~tree[all_later]], source, width)
+    # Groups are collected by length across domains, since equal linear equations share a template. Their order must not
+    # depend on which domain came first.
     ordered = []
     for length, parts in found.items():
         set_, place, item, variable, coefficient = (np.concatenate(c) for c in zip(*parts, strict=True))
@@ -275,7 +283,8 @@ def _add_equations(
 def _mixtures(
     nominal: np.ndarray, flow: np.ndarray, sign: np.ndarray, leaves: np.ndarray, enters: np.ndarray, source: Provenances
 ) -> list[EquationGroup]:
-    """What enters each of the ports that meet; all arrays (junctions, ports). One group for each place among them."""
+    """The equations of what enters each of the ports that meet, one group for each place among them; all arrays have
+    shape (junctions, ports)."""
     small = SMALL * np.where(nominal > 0, nominal, 1.0).min(axis=1)
     out = []
     for k in range(flow.shape[1]):

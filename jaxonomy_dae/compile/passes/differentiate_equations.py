@@ -16,6 +16,7 @@ from .number_columns import Columns
 def differentiate_equations(groups: tuple[EquationGroup, ...], offsets: Offsets, columns: Columns) -> Extended:
     """Builds the extended system; inputs have derivatives as high as equations and variables need them."""
     column, n_unknown = columns.with_inputs, columns.n_unknown
+    # Index reduction sees unknowns only. How often an input is differentiated follows from the equations that read it.
     highest = np.concatenate([offsets.variable, columns.least[n_unknown:]])
     first_equation = 0
     for group in groups:
@@ -38,6 +39,8 @@ def differentiate_equations(groups: tuple[EquationGroup, ...], offsets: Offsets,
         rows = np.arange(len(group))
         counts = c[first_equation : first_equation + len(group)]
         template, k = group.template, 0
+        # The template is differentiated once for each order, whatever the number of its equations: those that need
+        # fewer derivatives drop out of `rows`.
         while len(rows):
             slot_base = np.array([b for b, _ in template.slots], np.int64)
             slot_q = np.array([q for _, q in template.slots], np.int64)

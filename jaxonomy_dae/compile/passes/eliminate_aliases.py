@@ -24,7 +24,8 @@ from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenances
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, VariableTable
 
-DECADES = 30.0  # that factors span at most: single precision has 38
+# Factors of aliases lie within so many decades of one: single precision has 38.
+DECADES = 30.0
 COMPARED = 4  # terms of an equation that are compared with each other: sorting all terms of a large model takes longer
 SWEEPS = 8  # after which equations of any length are looked at one by one
 
@@ -57,6 +58,7 @@ class _Classes:
         """Every variable as its own root."""
         n = len(v)
         # The better root: an input, then what is differentiated, fixed, started, no port variable; then the first.
+        # Inputs come before all others because they are known: nothing may replace them.
         better = np.lexsort((-np.arange(n), ~v.is_port, v.start.is_given, v.fixed, differentiated, v.is_input))
         merit, zeros = np.empty(n, np.int32), np.zeros(n, np.int32)
         merit[better] = own = np.arange(n, dtype=np.int32)
@@ -65,6 +67,8 @@ class _Classes:
     def link(self, old: np.ndarray, root: np.ndarray, order: np.ndarray, factor: np.ndarray, products: np.ndarray):
         """Makes former roots factor·(root)^(order), and all variables that had them, too."""
         n = len(self.root)
+        # Links are composed by arrays over all variables at once. Walking from link to link takes as many steps as a
+        # chain has.
         to = np.arange(n + 1, dtype=np.int32)  # the last place is ZERO's
         more, times, count = np.zeros(n + 1, np.int32), np.ones(n + 1), np.zeros(n + 1, np.int32)
         to[old], more[old], times[old], count[old] = root, order, factor, products
@@ -94,9 +98,13 @@ def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], Alia
     sweep = 0
     while True:
         terms = _canonical(terms.take(rest[terms.row]), classes)
+        # Joining equal variables shortens other rows: 0 = a − b + c with a = b is 0 = c. So it is repeated until
+        # nothing joins, before multiples are looked at.
         found = _join(terms, n_rows, classes)
         if (found == ZERO).all():
             count, _ = _starts(terms, n_rows)
+            # Rows of more terms may turn short inside `_follow`, since it puts found links in. But to go through all
+            # terms in Python at each sweep would take quadratic time on chains.
             short = terms if sweep >= SWEEPS else terms.take(count[terms.row] <= 2)
             # Equal variables are joined before multiples of each other, so that the order of equations does not decide
             # whether a velocity is named by its position or a position by its acceleration (v = x' and v' = −k·x).
@@ -110,6 +118,7 @@ def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], Alia
         replaced[used] = found[used]
         rest[used] = False
     is_zero = classes.root == ZERO
+    # Provenances of removed equations are kept: an error about an alias names the connection that made it.
     used = np.flatnonzero(~rest)
     provenance = Provenances.joined([g.provenance for g in linear])
     table = AliasTable(
@@ -136,6 +145,8 @@ def _canonical(terms: _Terms, classes: _Classes) -> _Terms:
     terms = terms.take(is_there)
     v, row = terms.variable, terms.row
     coefficient = classes.factor[v] * terms.coefficient
+    # What is left of terms that cancel is judged by their roundings: 0.1·a + 0.2·b − 0.3·c where a = b = c leaves
+    # 5e-17·a, which would seem to determine a. A factor that is a product of n numbers adds n roundings.
     noise = np.abs(classes.factor)[v] * terms.noise
     noise += EPS * classes.products[v] * np.abs(coefficient)
     root, order = classes.root[v], terms.order + classes.order[v]
@@ -179,6 +190,7 @@ def _join(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
     n = len(classes.root)  # in the graph, ZERO is the last node
     v = np.append(terms.variable, n)
     single = np.flatnonzero(count == 1)
+    # A derivative that is zero leaves its variable constant, not zero.
     single = single[(terms.order[start[single]] == 0) & ~classes.is_input[v[start[single]]]]
     pair = np.flatnonzero(count == 2)
     a, b = start[pair], start[pair] + 1
@@ -191,15 +203,18 @@ def _join(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
     left = np.concatenate([v[start[single]], v[a]])
     right = np.concatenate([np.full(len(single), n), v[b]])
     sign = np.concatenate([np.ones(len(single)), np.sign(-terms.coefficient[b] / terms.coefficient[a])])
+    # The graph has the variables that occur in these rows alone: sweeps after the first join few of a large model.
     nodes, ends = np.unique(np.concatenate([left, right]), return_inverse=True)
     left, right = np.sort(ends.reshape(2, -1), axis=0)
     edge, first = np.unique(left * len(nodes) + right, return_index=True)  # of rows that say the same, the first
     # Of a loop, the equation that was written last is left over: it repeats the others, or contradicts them.
     # (Older versions of SciPy span trees of graphs with 32-bit indices only.)
     places = left[first].astype(np.int32), right[first].astype(np.int32)
+    # Numbers of rows plus one, because SciPy takes a weight of zero for no edge.
     graph = sp.csr_array((row[first] + 1.0, places), shape=(len(nodes),) * 2)
     tree = sp.coo_array(minimum_spanning_tree(graph))
     n_parts, part = connected_components(tree, directed=False)
+    # Zero counts as one of them: an input that would be zero is a contradiction to be named, not an alias.
     is_fixed = np.append(classes.is_input, True)[nodes]  # a part may have one of those: it is the root
     too_many = np.bincount(part, is_fixed, n_parts) > 1
     merit = np.append(classes.merit, n)[nodes]
@@ -210,6 +225,8 @@ def _join(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
     i, j = np.append(tree.coords[0], top), np.append(tree.coords[1], np.full(n_parts, every))
     _, before = breadth_first_order(sp.csr_array((np.ones(len(i)), (i, j)), shape=(every + 1,) * 2), every, False)
     before = before[:every]
+    # A part with two known quantities has an equation that determines nothing. `_follow` joins what it can of it and
+    # leaves that equation for the structural check to name.
     child = np.flatnonzero((before != every) & ~too_many[part])
     if not len(child):
         return found
@@ -217,6 +234,7 @@ def _join(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
     chosen = first[np.searchsorted(edge, lower * len(nodes) + upper)]
     up, total = np.arange(every), np.ones(every)
     up[child], total[child] = before[child], sign[chosen]
+    # Each round doubles the length of what is followed: a chain of a million equal variables takes twenty.
     while not np.array_equal(up[up], up):
         total, up = total * total[up], up[up]
     names = np.append(np.arange(n), ZERO)[nodes]
@@ -236,6 +254,7 @@ def _follow(terms: _Terms, n_rows: int, classes: _Classes, multiples: bool) -> n
     found = np.full(n_rows, ZERO)
     links: dict[int, tuple[int, int, float, int]] = {}
 
+    # Union–find with path compression (Tarjan 1975): links form chains, and rows ask for their ends again and again.
     def find(v: int) -> tuple[int, int, float, int]:
         order, factor, products, path = 0, 1.0, 0, []
         while v in links:
@@ -278,15 +297,20 @@ def _as_link(row: list[tuple[int, int, float]], classes: _Classes) -> tuple[int,
         v, order, _ = row[0]
         return None if order or classes.is_input[v] else (v, (ZERO, 0, 1.0, 0))
     (a, p, ca), (b, q, cb) = row
+    # a' = c·a is a differential equation, not an alias.
     if a == b:
         return None
     if (p == q == 0 and classes.merit[a] > classes.merit[b]) or p > 0:
         a, p, ca, b, q, cb = b, q, cb, a, p, ca
+    # Equal derivatives leave a constant between their variables. And an input cannot be replaced.
     if p > 0 or classes.is_input[a]:
         return None
     factor = -cb / ca
+    # A quotient of coefficients may underflow or overflow. The equation then stays as it is.
     if not 0 < abs(factor) < np.inf:
         return None
+    # It is the members' factors that must not overflow, not the factor of this link: along a chain of ratios they
+    # multiply.
     smallest, largest = classes.decades[a] + np.log10(abs(factor))
     smallest, largest = min(classes.decades[b, 0], smallest), max(classes.decades[b, 1], largest)
     if max(-smallest, largest) > DECADES:

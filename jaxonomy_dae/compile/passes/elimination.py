@@ -49,6 +49,8 @@ def _eliminated(rows: list[Row], is_weak: Callable[[Any], bool]) -> tuple[list[i
         if not pivot:
             empty.append(i)
             continue
+        # The column with the fewest entries, so that little fills in, and the first among equals: weights must not
+        # depend on the order of a set.
         column = min(pivot, key=lambda c: (is_weak(pivot[c]), len(members[c]), c))
         for c in pivot:
             members[c].discard(i)
@@ -58,6 +60,8 @@ def _eliminated(rows: list[Row], is_weak: Callable[[Any], bool]) -> tuple[list[i
             for c, value in pivot.items():
                 change = factor * value
                 left = rows[k][c] - change if c in rows[k] else -change
+                # The pivot's column is dropped by position, not by value: in numbers with roundings, something might be
+                # left of it.
                 if left and c != column:
                     rows[k][c] = left
                     members[c].add(k)

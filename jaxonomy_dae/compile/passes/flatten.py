@@ -37,6 +37,7 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     variables = variable_table(model, driven)
     parameters, values = parameter_table(model)
     groups = joined_by_template(builder)
+    # Corrections redirect derivatives in the equations that are there, so they come after all that writes equations.
     variables, groups, rows = add_corrections(model, diagram, variables, groups, networks)
     events, held, accounts = event_table(model), held_table(model), read_accounts(model)
     name = diagram.name or ""

@@ -16,6 +16,8 @@ def linear_equation(terms: Sequence[tuple[int, int, float]], provenance: Provena
 
 def joined_by_template(groups: Sequence[EquationGroup]) -> tuple[EquationGroup, ...]:
     """One group for each template, in the order in which the templates first occur."""
+    # A dictionary keeps the order of insertion: the order of equations, and with it every choice among equals, follows
+    # the order of declaration.
     alike: dict[str, list[EquationGroup]] = {}
     for group in groups:
         alike.setdefault(group.template.key, []).append(group)

@@ -67,6 +67,8 @@ class HighestDerivatives:
             group = self.groups[g]
             point = np.where(group.variable == ZERO, 0.0, tried(group.variable, group.order, trial))
             slots = point.shape[1]
+            # Nothing is known of a function's derivatives, and its weights may be trained: numbers without pattern
+            # stand for them, so that they cancel with nothing but themselves.
             if group.template.opaque is not None:  # any function
                 slopes = [np.ones(len(group)), *(somewhere(group.variable[:, 0], k, trial) for k in range(1, slots))]
                 values = np.stack(slopes, axis=-1) * group.factor
@@ -141,6 +143,7 @@ class HighestDerivatives:
             quantity = np.array(found, np.int64).reshape(group.variable.shape)
             groups.append(group.reading(quantity, count + np.arange(len(group))))
             count += len(group)
+        # By terms as well as by entries: an entry that is a sum hides that one of its terms is lost.
         size, _ = natural_sizes(groups, count, np.zeros(len(number)), self.values, by_terms=True)
         return groups, np.array(list(number), np.int64).reshape(-1, 2), np.abs(size)
 
@@ -153,6 +156,7 @@ class HighestDerivatives:
             group = self.groups[place.group]
             numbers = group.template.numbers(group.coefficient[place.instances]) * group.factor[place.instances]
             values = numbers[place.own, place.slot]
+            # One entry that is no number makes the whole block one of functions.
             if np.isnan(values).any():
                 return None
             for i, j, value in zip(

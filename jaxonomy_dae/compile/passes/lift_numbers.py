@@ -26,6 +26,7 @@ def lifted(rows: Sequence[EquationGroup]) -> list[EquationGroup]:
     than `MANY` of them."""
     out = list(rows)
     symbolic = [(k, r.template) for k, r in enumerate(rows) if isinstance(r.template, SymbolicTemplate)]
+    # Few templates keep their numbers: there, these are folded into products.
     if len({template.key for _, template in symbolic}) <= MANY:
         return out
     shapes: dict[tuple[Any, ...], dict[str, _Variant]] = {}
@@ -37,6 +38,7 @@ def lifted(rows: Sequence[EquationGroup]) -> list[EquationGroup]:
         if len(variants) <= MANY:
             continue
         columns = list(zip(*(v.numbers for v in variants.values()), strict=True))
+        # Numbers that are the same in all variants stay in the template.
         differ = [j for j, column in enumerate(columns) if any(c != column[0] for c in column)]
         filled: dict[Hashable, Node] = {_label(j): constant(column[0]) for j, column in enumerate(columns)}
         filled |= {_label(j): leaf(number_label(k)) for k, j in enumerate(differ)}
@@ -61,6 +63,8 @@ def _label(k: int) -> tuple[str, int]:
 
 def _shape(graph: Node) -> tuple[Node, list[Number]]:
     """(the graph with a leaf for each of its numbers, these numbers), in an order that does not depend on them."""
+    # Terms of a sum are sorted by digests, in which the numbers take part: two equations of one shape would list their
+    # numbers in different orders. So terms are sorted by what they are without numbers.
     anonymous: dict[Node, Node] = {}
     for n in postorder([graph]):
         anonymous[n] = _without_numbers(n, n.arguments, anonymous, lambda _: _ANY)

@@ -77,6 +77,8 @@ def null_vectors(matrix: BlockMatrix) -> list[Row]:
             dict(zip(np.flatnonzero(w).tolist(), w[w != 0].tolist(), strict=True))
             for w in left_null_vectors(*(part.toarray() for part in matrix.sparse()))
         ]
+    # Most large blocks are regular, and one factorization shows it. Elimination with bounds of errors takes Python's
+    # time for each operation.
     if matrix.shape[0] == matrix.shape[1] and sparse_rank_of(*matrix.sparse()).is_regular:
         return []
     rows = matrix.rows()
@@ -117,6 +119,8 @@ def _verified(null: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> list[np
     null = null.copy()
     chosen: list[int] = []
     for k in range(len(null)):  # Gauss–Jordan elimination with complete pivoting
+        # An orthogonal basis of several null vectors mixes them. Elimination takes them apart, one for each redundant
+        # equation, so that an error or a combination names few equations.
         r, c = np.unravel_index(np.argmax(np.abs(null[k:])), null[k:].shape)
         null[[k, k + int(r)]] = null[[k + int(r), k]]
         null[k] /= null[k, c]
@@ -125,6 +129,8 @@ def _verified(null: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> list[np
         chosen.append(int(c))
     found = []
     for w, c in zip(null, chosen, strict=True):
+        # An entry of rounding would draw an equation into the combination that has nothing to do with it. But where
+        # columns cancel only with a small weight, it belongs.
         candidates = (np.where(np.abs(w) < least, 0.0, w) * rows / rows[c] for least in NO_WEIGHT)
         found.append(next((w for w in candidates if cancels(w, matrix)), None))
     return [_refined(w, matrix) for w in found if w is not None]
@@ -139,6 +145,7 @@ def _refined(w: np.ndarray, matrix: np.ndarray) -> np.ndarray:
         terms = better[used, None] * matrix[used]
         size = np.abs(terms).max(axis=0, initial=0.0)
         terms = terms[:, size > 0] / size[size > 0]
+        # The sum cancels to the last digits, and those are what is corrected by.
         left = terms.astype(np.longdouble).sum(axis=0).astype(float)
         others = better[used] != 1.0
         better[used[others]] *= 1 + np.linalg.lstsq(terms[others].T, -left, rcond=None)[0]
@@ -148,5 +155,6 @@ def _refined(w: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 def rational(value: float) -> Number:
     """The simple fraction that a number rounds, if there is one."""
     found = Fraction(value).limit_denominator(LARGEST_DENOMINATOR)
+    # A weight that is a fraction stays exact in the combination, so that terms that should cancel do.
     is_simple = abs(found.numerator) * found.denominator <= SIMPLE
     return found if is_simple and abs(float(found) - value) <= CANCELLED * abs(value) else value

@@ -46,6 +46,8 @@ def number_columns(flat: FlatModel, alias: AliasTable) -> Columns:
     number = np.full(n, -1, np.int64)
     number[variable] = np.arange(len(variable))
     named = np.flatnonzero(alias.root != ZERO)
+    # A variable that equals a derivative occurs in no equation any more, and may still be read: nothing else would make
+    # index reduction provide that derivative.
     least = np.zeros(n, np.int64)
     np.maximum.at(least, alias.root[named], alias.order[named])
     return Columns(number, variable, len(unknown), is_input, least[variable])

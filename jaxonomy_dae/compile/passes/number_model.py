@@ -87,6 +87,7 @@ class ModelNumbers:
             order.append(component)
             waiting.extend(_child(c)[0] for c in component.children.values())
         counts: dict[int, np.ndarray] = {}
+        # In reverse, so that what a component holds is counted before it.
         for component in reversed(order):
             inside = self._sizes(component.children, counts)
             counts[id(component)] = np.sum([np.array(_own(component)), *inside], axis=0)

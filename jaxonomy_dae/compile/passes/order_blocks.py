@@ -64,6 +64,7 @@ def order_blocks(model: ReducedModel, selection: StateSelection) -> Blocks:
     n = len(equations)
     pointer = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(np.int64)
     matched = maximum_matching(pointer, columns, len(unknowns))
+    # The structural check has passed before, but states and constraints have been taken away since.
     if (matched < 0).any() or n != len(unknowns):
         raise StructuralError(_nothing_left(model, equations[matched < 0]))
 
@@ -72,7 +73,9 @@ def order_blocks(model: ReducedModel, selection: StateSelection) -> Blocks:
     equation_of[matched] = np.arange(n)
     source = equation_of[columns]
     dependency = sp.coo_array((np.ones(len(rows), np.int8), (rows, source)), shape=(n, n)).tocsr()
+    # Whatever perfect matching was found, the strongly connected components are the same (Dulmage & Mendelsohn 1963).
     n_blocks, label = connected_components(dependency, directed=True, connection="strong")
+    # Levels rather than one order: blocks of one level and one shape are evaluated at once.
     level = _levels(label[rows], label[source], n_blocks)
     # Deterministic order: by level, then by the block's first equation.
     first_equation = np.full(n_blocks, n, np.int64)
@@ -100,6 +103,7 @@ def _nothing_left(model: ReducedModel, equations: np.ndarray) -> str:
 
 def _levels(block: np.ndarray, needs: np.ndarray, n_blocks: int) -> np.ndarray:
     """The length of the longest chain of blocks below each block."""
+    # Several entries may join the same two blocks. They count once, since a block waits for blocks.
     outside = block != needs
     first, second = np.divmod(distinct(needs[outside] * np.int64(n_blocks) + block[outside]), max(n_blocks, 1))
     waiting = np.bincount(second, minlength=n_blocks)

@@ -68,6 +68,8 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     # Starts are compared in the equations that the user wrote, before any are combined.
     equal = check_equal_starts(flat, groups, alias)
 
+    # Parameters take part with their values: whether derivatives cancel may depend on them. The combination that is
+    # found holds for all values, or guards itself.
     groups, signature, offsets, cancelled = reduce_with_cancellation(
         groups, signature, columns, matching, flat.parameters, flat.declares.values
     )
@@ -79,6 +81,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     selection = select_states(model, mode, merits(model, prefer_states))
     # Blocks are those of the unknowns that are neither states nor inputs, so they follow the selection.
     blocks = order_blocks(model, selection)
+    # A row of the states can be corrected only where the target has one, which is known from here on.
     _check_row_targets(model, selection, mode)
     notes = (
         *_loose_ports(flat),

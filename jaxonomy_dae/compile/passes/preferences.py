@@ -32,6 +32,7 @@ def merits(model: ReducedModel, prefer_states: Sequence[str]) -> Int[np.ndarray,
             raise ModelError(f"prefer_states: '{name}' is not a variable: " + nearest(name, index))
         q, _ = variables[index[name]]
         if q >= 0 and not asked[q]:
+            # Earlier names are preferred to later ones.
             asked[q] = len(wanted) - k
     return np.stack([asked, fixed, started], axis=1)
 

@@ -23,6 +23,8 @@ def add_components(model: ModelNumbers, builder: list[EquationGroup]):
     for i in model.instances:
         c = i.component
         if c.equations:
+            # By id rather than by SymPy's equality, which compares whole trees. Components of one class share their
+            # residuals.
             for residual in c.equations:
                 if id(residual) not in read_once:
                     read_once[id(residual)] = read_expression(residual, model.path(i))
@@ -34,6 +36,8 @@ def add_components(model: ModelNumbers, builder: list[EquationGroup]):
         number = members.number
         for k, (graph, residual) in enumerate(zip(graphs, parts[0].component.equations, strict=True)):
             variables, parameters = slots_of(model, parts[0], residual, graph)
+            # All linear equations of one length with plain numbers are one template, whoever wrote them: connections
+            # and definitions take most of a model, and alias elimination works on their coefficients.
             coefficients = linear_coefficients(graph, variables)
             ids = members.ids([v.path for v in variables], "variable")
             parameter_ids = members.ids([p.path for p in parameters], "parameter")
@@ -71,6 +75,7 @@ def slots_of(
         if s.path in position:
             return (0, position[s.path], nth)
         resolve = model.variable if isinstance(s, VariableSymbol) else model.parameter
+        # A path such as "a.v" would order by the children's names, so that renaming one made another template.
         return (1, int(resolve(i, s.path)[0]), nth)
 
     symbols = [s for s in symbols_of(expression) if symbol_label(s) in graph.leaves]

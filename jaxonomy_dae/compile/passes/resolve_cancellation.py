@@ -60,11 +60,14 @@ def reduce_with_cancellation(
     """
     notes: list[str] = []
     n_unknown = signature.n_variables
+    # The matching of the structural check holds in the first round only: afterwards equations have been replaced.
     highest: np.ndarray | None = matching
     for _ in range(ROUNDS):
         offsets = reduce_index(signature, columns.least_of_unknown, highest)
         jacobian = HighestDerivatives(groups, offsets, columns.number, values)
         replaced, added, combined = [], [], []
+        # One combination in every block and round: each replaced equation changes the offsets, and with these which
+        # derivatives are the highest.
         for equations in _blocks_that_may_cancel(signature, jacobian):
             found = _combination(jacobian, equations, parameters.names, parameters.discrete)
             if found is not None:
@@ -77,6 +80,8 @@ def reduce_with_cancellation(
         notes += [f"highest derivatives cancel in {'a ' if source.sources else ''}{source}" for source in sources]
         groups = (*_without(groups, replaced), *added)
         signature, highest = incidence(groups, columns.number, n_unknown), None
+        # A combination in which everything cancels has no unknown left: these equations repeat or contradict each
+        # other. Pantelides' algorithm would not end on them.
         if (maximum_matching(signature.pointer, signature.variable, n_unknown) < 0).any():
             raise StructuralError(_dependent(combined))
     raise StructuralError(_dependent(combined))
@@ -96,6 +101,8 @@ def _blocks_that_may_cancel(signature: Incidence, jacobian: HighestDerivatives) 
     order = np.argsort(label, kind="stable")
     start = np.concatenate([[0], np.cumsum(sizes)])
     several = sizes > 1
+    # A single equation with a single slot of its highest derivative cannot cancel. These are nearly all equations of a
+    # model, and no matrix of theirs is made.
     several[label[_cancelled_alone(jacobian)]] = True
     chosen = np.flatnonzero(several).tolist()
     return [np.sort(order[start[b] : start[b + 1]]) for b in chosen]
@@ -116,6 +123,7 @@ def _cancelled_alone(jacobian: HighestDerivatives) -> np.ndarray:
             continue
         partials, errors = jacobian.partials(g, 0)
         total, bound = (highest * partials).sum(axis=1), (highest * errors).sum(axis=1)
+        # So the comparison is written such that not-a-number counts as suspect.
         # Equations without a value at this point are evaluated at others.
         found.append(own[several & ~(np.abs(total) > bound)])
     return np.concatenate(found)
@@ -131,6 +139,8 @@ def _combination(
     - `StructuralError` if it is singular for the given parameter values alone, or in a way that depends on the point.
     """
     columns = jacobian.offsets.matched_variable[equations]
+    # Coefficients of connections and differences are mostly ±1. With fractions nothing has to be judged, and a ring of
+    # any size is eliminated in linear time.
     exact = jacobian.rows(equations, columns, _simple)
     if exact is None:
         return _sampled_combination(jacobian, equations, columns, names, discrete)
@@ -147,6 +157,8 @@ def _numeric_combination(
     jacobian: HighestDerivatives, equations: np.ndarray, columns: np.ndarray, weights: Row
 ) -> tuple[int, EquationGroup]:
     """An equation of a block, and the combination of equations with these weights that replaces it."""
+    # The equation that is replaced stands in the combination as it is, with the weight one. From a derivative of it,
+    # it would follow up to a constant alone.
     used = sorted(weights)
     parts = _parts(jacobian, equations[used], columns)
     chosen: list[Node] = [constant(weights[k] / weights[used[parts.unit]]) for k in used]
@@ -160,6 +172,8 @@ def _sampled_combination(
     are functions, or numbers that cancel to rounding. None if the block is regular at one of them."""
     groups = jacobian.groups
     trials, together = [], None
+    # A block of functions may be singular at one point by chance. If it is regular at one point, it is regular in
+    # general.
     wanted = 1 if jacobian.is_constant(equations, columns) else STATES
     for trial in range(TRIALS):
         matrix = jacobian.at(equations, columns, trial)
@@ -174,9 +188,13 @@ def _sampled_combination(
     if together is None:
         return None
     if wanted > 1:
+        # Near one, a term that is small there may be lost beside others: x′ + (1e12 + x)·y′ looks constant. At natural
+        # sizes all terms of an equation are alike.
         natural = [jacobian.at_natural_size(equations, columns, trial) for trial in trials]
         if any(matrix.is_finite and not null_vectors(matrix) for matrix in natural):
             return None
+    # Each matrix has a null vector of its own. Only one that they share is a combination of equations; otherwise the
+    # weights would have to depend on the state.
     everywhere = null_vectors(together)
     if not everywhere:
         raise StructuralError(_hidden([provenance_of(groups, int(e)) for e in equations]))
@@ -184,6 +202,8 @@ def _sampled_combination(
     found = _weights(parts, jacobian.values, discrete, trials)
     if found is None:
         here = [jacobian.place(e) for e in parts.equations.tolist()]
+        # The block has a null vector at these parameters and none as a function of them: it is the given values that
+        # are special.
         concerned = list(dict.fromkeys(p for g, i in here for p in groups[g].parameter[i].tolist()))
         if not concerned:  # numbers alone, which cancel to rounding
             raise StructuralError(_hidden(parts.sources))
@@ -208,6 +228,8 @@ class _Parts(NamedTuple):
 def _parts(jacobian: HighestDerivatives, equations: np.ndarray, columns: np.ndarray) -> _Parts:
     """**Raises:** `StructuralError` for a function that is evaluated in JAX only."""
     c = jacobian.offsets.equation[equations]
+    # All equations are brought to the same highest derivatives, by as few differentiations as possible: what cancels in
+    # F₁ − F₂′ does so in its derivatives, too.
     lowest = int(c.min())
     places = [jacobian.place(e) for e in equations.tolist()]
     graphs = [graph_of(jacobian.groups[g], i, k) for (g, i), k in zip(places, (c - lowest).tolist(), strict=True)]
@@ -288,6 +310,8 @@ def _weights(parts: _Parts, values: np.ndarray, discrete: np.ndarray, trials: Se
             graph = partial_derivative(equation, label)
             moving = [leaf for leaf in graph.leaves if leaf[0] == "quantity"]
             for k, trial in enumerate(trials):
+                # Weights may depend on parameters, not on the state. So states are numbers here, the same ones in all
+                # entries, with a column for each point.
                 point = {leaf: constant(float(tried(leaf[1], leaf[2], trial))) for leaf in moving}
                 if TIME_LABEL in graph.leaves:
                     point[TIME_LABEL] = constant(0.37 + 0.1 * trial)

@@ -19,6 +19,8 @@ class Rounded:
     error: float | np.ndarray
 
     def __bool__(self) -> bool:
+        # An entry counts if it is seen at one sample: a function of parameters that vanishes at some of them is not
+        # zero.
         seen = abs(self.value) > self.error
         return seen if isinstance(seen, bool) else bool(np.any(seen))
 
@@ -45,5 +47,7 @@ class Rounded:
     def __truediv__(self, other: "Rounded") -> "Rounded":
         """By a number that is not zero."""
         value = self.value / other.value
+        # The divisor is seen to be other than zero, so this is positive; it may be small, and the error large, which
+        # says that the quotient has no digits.
         least = abs(other.value) - other.error
         return Rounded(value, (self.error + abs(value) * other.error) / least + EPS * abs(value))

@@ -28,7 +28,8 @@ from ..model.tables import ZERO, EquationGroup, equation_offsets
 from ..model.typical_sizes import typical_sizes, unrounded_sizes
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
-POORER_PIVOT = 1e-3  # so much smaller if the better ones would all be of preferred states
+# If all good pivots are states that the user prefers, one that is so much smaller takes their place.
+POORER_PIVOT = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +60,8 @@ def _settled(groups: tuple[EquationGroup, ...], extended: Extended, c: np.ndarra
                 column = int(quantities.column[v]) if v != ZERO else -1
                 if 0 <= column < quantities.n_unknown_columns:
                     slots[column] = None if order or column in slots else slot
+            # An equation that is not differentiated restricts no candidate: what it alone determines is not a state
+            # anyway.
             unknowns[row] = slots
             for column in slots:
                 rows_of.setdefault(column, []).append(row)
@@ -71,6 +74,8 @@ def _settled(groups: tuple[EquationGroup, ...], extended: Extended, c: np.ndarra
             continue
         ((column, slot),) = unknowns[row].items()
         template = groups[int(np.searchsorted(first, row, side="right") - 1)].template
+        # The equation must give the variable itself and all of its derivatives, by a coefficient that cannot vanish on
+        # the way. Otherwise the variable is a state like others, and the constraint is projected onto.
         if slot is None or c[row] != quantities.highest[column] or not template.coefficient_is_constant(slot):
             continue
         found_rows.append(row)
@@ -124,11 +129,17 @@ def select_states(model: ReducedModel, mode: str, merit: np.ndarray) -> StateSel
         at = None
         for rows, members in parts:
             constant = entries.constant[members].all()
+            # Where the Jacobian of the constraints moves, every minimal set of states turns singular somewhere. A
+            # pendulum whose states are y and its velocity is lost at the lowest point, where they tell nothing about x.
+            # All candidates with a projection after each step pass there, in as many steps as without the projection.
             if mode == "projection" or (mode == "auto" and not constant):
                 projected[rows] = True
                 continue
+            # The initial point is searched only where pivots are needed, since that solves for a consistent point.
             if at is None:
                 at, scale = initial_point(model, model.flat.declares), _scale(model)
+                # A start is known to some roundings of its typical size. A position of 1e-17 m that a computation left
+                # is then zero, and no pivot.
                 known = KNOWN * (np.abs(at.values) + np.append(typical_sizes(model, at.parameters), 0.0))
                 numbers, errors = values_and_errors(groups, extended, entries, at, known)
             columns = np.unique(entries.column[members])
@@ -185,16 +196,21 @@ def _dummy_derivatives(model: ReducedModel, dense, errors, c, columns, merit: np
     for level in range(1, int(c.max()) + 1):
         rows = np.flatnonzero(c >= level)
         available = available[quantities.highest[columns[available]] >= level]
+        # Mattsson & Söderlind (1993) go from the highest derivatives down, and a level chooses among the columns that
+        # the level above has chosen: constraints of lower order are fewer, and have the same Jacobian.
         # If the (d − level + 1)-th derivative is a dummy, the quantity below it is not a state.
         below = quantities.first[columns[available]] + quantities.highest[columns[available]] - level
         inside = np.ix_(rows, available)
         keys = [(*merit[q].tolist(), -q) for q in below.tolist()]
+        # Columns are compared in sizes of their variables. In the units of the model, a pressure of 1e5 Pa beside a
+        # flow of 1e-3 m³/s would decide what is a state.
         picked = _pivots(dense[inside] * scale[below], errors[inside] * scale[below], keys)
         if picked is None:
             return None, notes
         by_merit = sorted(range(len(below)), key=keys.__getitem__)
         wanted = set(by_merit[: len(picked)])
         for k in picked:
+            # A preference that is overruled without a word would look like a mistake of the compiler.
             if k not in wanted and _is_preferred(keys[k]):
                 notes.append(
                     f"{model.names[below[k]]} was preferred as a state, but the constraints have to determine it: any "
@@ -214,6 +230,7 @@ def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[i
     if not rank_of(matrix, errors).is_regular:
         return None
     matrix = above_errors(matrix, errors)
+    # Rows have units of their own: an equation that was multiplied by 1e9 must not be eliminated first.
     largest = np.abs(matrix).max(axis=1, keepdims=True)
     work, off = matrix / largest, errors / largest
     free_rows = list(range(work.shape[0]))
@@ -228,12 +245,15 @@ def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[i
         best = best_of_column.max()
         if not best > 0:
             return None
+        # A threshold as of sparse elimination, rather than the best pivot: which of two speeds on one shaft is a state
+        # is as good as the other, even if their coefficients differ tenfold, and so the user's preference counts.
         good = np.flatnonzero(best_of_column >= POOR_PIVOT * best).tolist()
         if all(_is_preferred(keys[free_columns[k]]) for k in good):
             poorer = np.flatnonzero(best_of_column >= POORER_PIVOT * best).tolist()
             good = [k for k in poorer if not _is_preferred(keys[free_columns[k]])] or good
         k = min(good, key=lambda k: keys[free_columns[k]])
         column = free_columns.pop(k)
+        # The first of the rows that are alike up to rounding, so that the kernel of BLAS does not choose.
         row = free_rows.pop(int(np.argmax(sub[:, k] >= (1 - ALIKE) * best_of_column[k])))
         picked.append(column)
         if free_rows:

@@ -45,6 +45,8 @@ def tree_edges(
 
     for root in roots.tolist():
         join(root, n)
+    # Branches within components are part of the tree in any case, since their equations are the component's own. Only
+    # of connections one may be chosen to close a loop.
     for a, b in branches.tolist():
         join(a, b)
     found = np.array([join(a, b) for a, b in edges.tolist()], bool)

@@ -52,6 +52,7 @@ def mixed(
     n = flow.shape[1]
     variable = np.concatenate([enters[:, None], flow, stream], axis=1)
     factor = np.ones(variable.shape)
+    # The sign goes into the slot's factor, so that faces seen from inside and outside share one template.
     factor[:, 1 : n + 1] = sign
     group = EquationGroup.of(mixing(n), variable, np.zeros(variable.shape), source, coefficient=small[:, None])
     return dataclasses.replace(group, factor=factor)

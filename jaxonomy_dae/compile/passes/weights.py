@@ -68,7 +68,11 @@ def weights_in_parameters(
         if found:
             sampled[i][c] = found
     one = Sampled(ONE, Rounded(np.ones(numbers.shape[1]), np.zeros(numbers.shape[1])))
+    # To divide by an entry that vanishes at a sample leaves all later ones without a value there. Another pivot is
+    # taken if there is one.
     found = elimination.null_vectors(sampled, one, lambda entry: entry.value.may_vanish)
+    # With several combinations it is open which one to take; without the equation at `unit` in it, the equation to be
+    # replaced would not be part of what replaces it.
     if len(found) != 1 or unit not in found[0]:
         return None
     by = found[0][unit]

@@ -36,6 +36,7 @@ def needed_where(roots: Sequence[Node]) -> dict[Node, Needed]:
     needed: dict[Node, Needed] = dict.fromkeys(order, NEVER)
     for root in roots:
         needed[root] = ALWAYS
+    # From results downwards: all that uses a node is known when its turn comes.
     for node in reversed(order):
         here = needed[node]
         if node.operation == "select":
@@ -56,6 +57,8 @@ def guards(roots: Sequence[Node]) -> dict[Node, Needed]:
     needed = needed_where(roots)
     wanted = {n: parts for n, parts in needed.items() if parts != ALWAYS and is_partial(n)}
     place = {n: k for k, n in enumerate(postorder(roots, lambda n: before(n, wanted)))}
+    # A node may stand below the condition of its own guard, where it is shared with it. Then neither can be evaluated
+    # first, and such conditions are left out of guards.
     if all(place[a] < place[n] for n in place for a in before(n, wanted)):
         return wanted
     kept: dict[Node, Needed] = {}

@@ -41,10 +41,13 @@ def _slope(n: Node, inner: list[Node]) -> Node:
         condition, _, _ = n.arguments
         return select(condition, inner[1], inner[2])
     if operation == "smooth":
+        # The derivative has the same branches, and they are no events either.
         return marked(inner[0])
     if operation == "power":
         base, exponent = n.arguments
         terms = []
+        # The two parts stand apart: where the exponent does not move there is no logarithm of the base, which may be
+        # negative.
         if inner[0] is not ZERO:
             terms.append((1, multiply(exponent, power(base, linear([(1, exponent)], -1)), inner[0])))
         if inner[1] is not ZERO:
@@ -66,6 +69,7 @@ def _product_slope(n: Node, inner: list[Node]) -> Node:
         ZERO if s is ZERO else scale(e, multiply(power(b, e - 1), s))
         for b, e, s in zip(n.arguments, n.data, inner, strict=True)
     ]
+    # Each slope beside all the other factors would be n² products. Merging pairs halves the factors at each pass.
     while len(factors) > 8:
         paired, moved = [], []
         for k in range(0, len(factors) - 1, 2):

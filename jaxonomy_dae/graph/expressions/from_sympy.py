@@ -35,6 +35,7 @@ class UnsupportedExpression(Exception):
 
 def atoms_of(expression: sympy.Basic) -> set:
     """The symbols and numbers of an expression, found in time linear in its size."""
+    # By identity: `expression.atoms` walks a shared part as often as it occurs.
     seen: set[int] = set()
     out = set()
     stack = [expression]
@@ -63,6 +64,7 @@ def read(expression: sympy.Basic, label: Callable[[sympy.Symbol], Hashable], mar
 
     - `UnsupportedExpression` naming what cannot be evaluated.
     """
+    # Identities may be keys, since the expression holds its parts. Equality would compare whole trees.
     known: dict[int, Node] = {}
     stack: list[tuple[sympy.Basic, bool]] = [(expression, False)]
     while stack:
@@ -153,6 +155,7 @@ def _folded(name: str) -> Callable[..., Node]:
 
 
 def _piecewise(*parts: Node) -> Node:
+    # SymPy's value where none of the conditions holds.
     value = constant(float("nan"))
     for branch, condition in reversed(list(zip(parts[::2], parts[1::2], strict=True))):
         value = select(condition, branch, value)
@@ -182,6 +185,7 @@ def _frac(u: Node) -> Node:
 def _sinc(u: Node) -> Node:
     """sin(u)/u, by its series where the quotient and its derivatives cancel."""
     square = power(u, 2)
+    # Terms to u²⁴/25! leave 1e-28 of the value at u = 1, and hardly more of the first derivatives.
     series = ONE
     for k in range(12, 0, -1):
         series = linear([(Fraction(-1, 2 * k * (2 * k + 1)), multiply(square, series))], 1)

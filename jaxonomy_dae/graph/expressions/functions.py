@@ -60,6 +60,7 @@ def apply(name: str, *arguments: Node) -> Node:
     if all(v is not None for v in values):
         with np.errstate(all="ignore"):
             found = float(TABLE[name].numpy(*(np.float64(float(v)) for v in values)))  # pyright: ignore
+        # A whole value of exact arguments stays exact, as that of cos(0), so that terms beside it may cancel exactly.
         if all(isinstance(v, int | Fraction) for v in values) and found.is_integer() and abs(found) < 1e6:
             found = int(found)
         return constant(found)
@@ -116,6 +117,7 @@ def _hypot(xp):
 
     def function(a, b):
         square = a * a + b * b
+        # √0 has an infinite slope, and a gradient keeps ∞·0 of it, which is no number, though its branch is not taken.
         away = square > 0
         return xp.where(away, xp.sqrt(xp.where(away, square, 1.0)), 0.0)
 
@@ -131,6 +133,7 @@ def _logistic(xp):
     """1/(1 + exp(−x)), with all derivatives finite and digits kept on both sides."""
 
     def function(x):
+        # Either side takes the exponential that decays. The other one overflows, and leaves ∞/∞ in derivatives.
         positive = x > 0
         small = xp.exp(xp.where(positive, -x, x))
         return xp.where(positive, 1.0, small) / (1 + small)
@@ -140,6 +143,7 @@ def _logistic(xp):
 
 def _sech(xp):
     def function(x):
+        # Not −|x|: JAX takes the slope of |x| at 0 to be 0, which makes the second derivative there zero. It is −1.
         negative = xp.where(x > 0, -x, x)
         return 2 * xp.exp(negative) / (1 + xp.exp(2 * negative))
 

@@ -57,6 +57,7 @@ class Kernel:
 
     def __call__(self, values: Sequence[Numeric], backend: str = "jax") -> list[Numeric]:
         if backend == "numpy":
+            # Values that are not finite are answers here. Who asks judges them, and a warning would name no equation.
             with np.errstate(all="ignore"):
                 return self._run([np.asarray(v, float) for v in values], backend)
         return self._run(values, backend)

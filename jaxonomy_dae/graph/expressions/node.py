@@ -32,6 +32,8 @@ class Node:
     leaves: frozenset
 
     def __reduce__(self):
+        # Pickle would recurse through arguments, and deep graphs exceed its limit. A table has no depth, and reading it
+        # by `make` keeps nodes unique in the process that reads.
         order: list[Node] = postorder([self])
         place = {n: k for k, n in enumerate(order)}
         rows = tuple((n.operation, tuple(place[a] for a in n.arguments), n.data) for n in order)
@@ -41,12 +43,15 @@ class Node:
         return f"Node({self.operation}, {self.data!r}, {len(self.arguments)} arguments)"
 
 
+# Held weakly, so that nodes go with the last graph that uses them.
 _unique: "weakref.WeakValueDictionary[bytes, Node]" = weakref.WeakValueDictionary()
 _NONE: frozenset = frozenset()
 
 
 def make(operation: str, arguments: tuple[Node, ...] = (), data: Any = None) -> Node:
     """The one node of this content, as it is: no simplification."""
+    # A digest of content rather than Python's hash, which differs between processes: arguments are sorted by it, and
+    # the order of a sum decides its rounding.
     text = f"{operation}|{data!r}|".encode()
     digest = hashlib.blake2b(text + b"".join(a.digest for a in arguments), digest_size=20).digest()
     found = _unique.get(digest)
@@ -57,6 +62,8 @@ def make(operation: str, arguments: tuple[Node, ...] = (), data: Any = None) -> 
     if operation == "leaf":
         node.leaves = frozenset([data])
     else:
+        # A set is shared with an argument wherever it is the same: sets of their own would take memory quadratic in the
+        # length of a chain.
         leaves = _NONE
         for argument in arguments:
             if not argument.leaves <= leaves:
@@ -189,6 +196,8 @@ def power(base: Node, exponent: Number | Node) -> Node:
             return make("power", (base, exponent))
         exponent = value
     exponent = _exact(exponent)
+    # Exponents that are written as floats are made exact: as such they merge with others, and √x is evaluated as a
+    # root.
     if isinstance(exponent, float) and exponent.is_integer() and abs(exponent) < 1e6:
         exponent = int(exponent)
     if isinstance(exponent, float) and exponent in (0.5, -0.5, 1.5, -1.5):
@@ -207,10 +216,12 @@ def power(base: Node, exponent: Number | Node) -> Node:
         else:
             raised = _monomial({rest: exponent})
         return scale(_power_of_numbers(c, exponent), raised)
+    # Only whole exponents distribute over factors: √(x²) is |x|, and √(x·y) is real for two negative factors.
     return _monomial({base: exponent})
 
 
 def _power_of_numbers(base: Number, exponent: Number) -> Number:
+    # Python raises an error here, where NumPy and JAX return an infinity.
     if base == 0 and exponent < 0:
         return math.inf
     if isinstance(exponent, int):
@@ -278,6 +289,7 @@ def postorder(roots: Iterable[N], before: Callable[[N], Iterable[N]] = attrgette
     seen: set[N] = set()
     out: list[N] = []
     for root in roots:
+        # A stack of its own, since graphs are deeper than Python's limit of recursion.
         stack: list[tuple[N, bool]] = [(root, False)]
         while stack:
             node, finished = stack.pop()

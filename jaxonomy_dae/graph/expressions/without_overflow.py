@@ -22,6 +22,7 @@ class _OnePlusExp(NamedTuple):
 def raised(base: Node, exponent: Node) -> Node:
     """base^exponent."""
     e = number(exponent)
+    # Positive whole powers of 1 + eˣ are infinite in truth.
     if e is None or (e > 0 and e == int(e)):
         return power(base, exponent)
     seen = _one_plus_exp(base)
@@ -77,6 +78,7 @@ def logarithm(u: Node) -> Node:
         return linear([(1, apply("log", constant(seen.factor))), (1, apply("softplus", seen.exponent))])
     c, rest = split(u)
     if rest.operation == "sum" and not rest.data[0] and c > 0:
+        # log(eᵃ + eᵇ) = a + softplus(b − a), in which no exponential overflows.
         exponents = [_exponent(factor, node) for factor, node in zip(rest.data[1], rest.arguments, strict=True)]
         if len(exponents) == 2 and None not in exponents:
             one, other = (e for e in exponents if e is not None)

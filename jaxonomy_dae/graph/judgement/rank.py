@@ -69,8 +69,11 @@ class Rank:
         product = (self.r[:, None] * self.errors * self.c) @ np.abs(right)
         x, bound = np.ones(m), np.inf
         for _ in range(ITERATIONS):
+            # For every positive x the largest quotient bounds ρ from above, so that the iteration may stop at any time
+            # and err on the safe side only.
             y = product @ x
             bound = min(bound, float((y / x).max(initial=0.0)))  # Collatz and Wielandt, for any x > 0
+            # A vector with zeros would lose the bound: it is kept positive.
             x = np.maximum(y / max(y.max(initial=0.0), TINY), EPS)
         return bound
 
@@ -117,6 +120,8 @@ def are_evident(matrices: Float[np.ndarray, "b m n"], errors: Float[np.ndarray, 
     if matrices.shape[1:] == (1, 1):  # a single coefficient has no scale but zero
         return finite & (size > errors)[:, 0, 0]
     seen = np.where(size > errors, matrices, 0.0)
+    # This glance is for the many blocks of ordinary runs: one batch of decompositions in place of a verdict for each.
+    # What it does not clear is judged by `rank_of`.
     rows = np.abs(seen).max(axis=2, keepdims=True, initial=0.0) + TINY
     columns = np.abs(seen / rows).max(axis=1, keepdims=True, initial=0.0)
     columns = np.where(columns > TINY, columns, 1.0)  # beside others, an unknown on which nothing depends is no fault
@@ -129,9 +134,13 @@ def are_evident(matrices: Float[np.ndarray, "b m n"], errors: Float[np.ndarray, 
 
 def rank_of(matrix: Float[np.ndarray, "m n"], errors: Float[np.ndarray, "m n"]) -> Rank:
     """Judges a finite matrix; a bound that is not finite says that nothing is known of its entry."""
+    # A bound that is not finite would make every product infinite. As large as the entry, it says the same: the entry
+    # may be zero.
     size = np.abs(matrix)
     errors = np.maximum(np.where(np.isfinite(errors), errors, size), EPS * size)
     seen = above_errors(matrix, errors)
+    # Equilibration takes a few passes, least squares of logarithms an iterative solve. Nearly all matrices are judged
+    # by the first.
     first = _decomposed(seen, errors, equilibrated)
     if first.condition < EASY and first.is_regular:
         return first

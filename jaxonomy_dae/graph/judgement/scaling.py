@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 PASSES = 10  # each halves, in logarithms, how far the largest entries are from one (Ruiz 2001): a thousandth is left
 LARGEST_EXPONENT = 300.0  # of ten, for a scale
@@ -25,6 +25,7 @@ def geometric_scales(matrix: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     row, column = a.coords
     k = np.arange(len(row))
     pattern = sp.csr_array((np.ones(2 * len(k)), (np.tile(k, 2), np.append(row, n + column))), shape=(len(k), n + m))
+    # Four digits of a logarithm are more than scales need: a factor of two would do.
     linalg: Any = scipy.sparse.linalg
     found = linalg.lsmr(pattern, -np.log10(np.abs(a.data)), atol=1e-4, btol=1e-4, maxiter=20 * (n + m))[0]
     exponent = np.clip(found, -LARGEST_EXPONENT, LARGEST_EXPONENT)
@@ -49,6 +50,8 @@ def equilibrated(matrix: Any, passes: int = PASSES) -> tuple[Any, np.ndarray, np
 
     for k in range(passes):
         if k == 0:
+            # Columns are scaled after rows, with the rows' scales in them: scaling both at once by what stood there
+            # before would depend on units.
             r = r / largest(row_of, n)
             c = c / largest(column_of, m)
             continue

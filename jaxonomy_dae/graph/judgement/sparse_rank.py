@@ -37,6 +37,8 @@ class SparseRank:
         iteration."""
         n = len(self.r)
         linalg: Any = scipy.sparse.linalg
+        # The factors of a singular matrix do not exist. The shift differs by row: one and the same shift leaves the
+        # matrix singular if it has that eigenvalue.
         shift = 1e-10 * sp.diags_array(1 + np.arange(n) / n)  # regular, whatever the kernel
         factors = linalg.splu(sp.csc_array(self.scaled + shift))
         left = right = np.ones(n) + np.arange(n) / n
@@ -55,6 +57,7 @@ def sparse_rank_of(matrix: Any, errors: Any) -> SparseRank:
     errors = sp.csr_array((np.where(known, errors.data, 0.0), errors.indices, errors.indptr), shape=errors.shape)
     errors = errors.maximum(EPS * size)
     seen = above_errors(sp.csr_array(matrix), errors)
+    # As for dense matrices, the dear scales are found only where the cheap ones leave the matter open.
     first = _factored(seen, errors, equilibrated)
     if first.condition < EASY and first.is_regular:
         return first

@@ -62,6 +62,8 @@ def _components(rows, columns, has_row: np.ndarray, has_column: np.ndarray) -> l
     n, m = len(has_row), len(has_column)
     graph = sp.coo_array((np.ones(len(rows)), (rows, n + columns)), shape=(n + m, n + m))
     _, label = connected_components(graph, directed=False)
+    # An equation without variables, or a variable without equations, has no entry and is still at fault: nodes are
+    # chosen by what was reached, not by their arcs.
     used = np.flatnonzero(np.concatenate([has_row, has_column]))
     labels, first = np.unique(label[used], return_index=True)
     order = np.argsort(label[used], kind="stable")

@@ -32,6 +32,7 @@ def compress(rows, columns, values, n_rows: int):
     rows, columns, values = (np.asarray(a, np.int64) for a in (rows, columns, values))
     sorting = np.lexsort((values, columns, rows))
     rows, columns, values = rows[sorting], columns[sorting], values[sorting]
+    # Values are the last key of the sorting, so that the last one of equal places has the highest order.
     last = np.ones(len(rows), bool)
     last[:-1] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1])
     rows, columns, values = rows[last], columns[last], values[last]

@@ -21,6 +21,8 @@ def maximum_matching(pointer: np.ndarray, columns: np.ndarray, n_columns: int) -
     """The matched column of every row of a pattern in compressed rows."""
     n_rows = len(pointer) - 1
     row_match, taken = np.full(n_rows, -1, np.int64), np.zeros(n_columns, bool)
+    # In a model most pairs are forced, since most equations name or connect something. Array operations take these in
+    # rounds. The search one by one, in lists, is for what they leave.
     if n_rows >= MANY:
         _match_forced(pointer, columns, row_match, taken)
     left, open_ = np.flatnonzero(row_match < 0), np.flatnonzero(~taken)
@@ -48,11 +50,15 @@ class _Side:
 
     @classmethod
     def of(cls, start: np.ndarray, neighbours: np.ndarray) -> "_Side":
+        # The sum of the neighbours' numbers is kept because it is the last neighbour itself once the degree is one:
+        # nothing has to be searched for.
         degree, running = np.diff(start), np.append(0, np.cumsum(neighbours))
         return cls(start, neighbours, degree, running[start[1:]] - running[start[:-1]])
 
     def lone(self, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Those of `near` that have one neighbour, and these neighbours, each once."""
+        # Two vertices may have the same last neighbour. `np.unique` gives it to the first of them, so that ties do not
+        # depend on chance.
         near = near[self.degree[near] == 1]
         neighbours, first = np.unique(self.total[near], return_index=True)
         return near[first], neighbours
@@ -103,6 +109,8 @@ def match_in_order(pointer: np.ndarray, columns: np.ndarray, n_columns: int, fir
     """A matching with priorities: as many of the `first` rows as possible, then each later row, in order, that can be
     matched beside all before it. Returns the column of each row, −1 if unmatched."""
     row_match = np.full(len(pointer) - 1, -1)
+    # An augmenting path never frees a row that is matched. So the rows that come first keep their places whatever is
+    # matched after them.
     row_match[:first] = maximum_matching(pointer[: first + 1], columns[: pointer[first]], n_columns)
     matched = row_match >= 0
     column_match = np.full(n_columns, -1)
@@ -119,6 +127,7 @@ def _karp_sipser(start, column, column_pointer, by_column, row_match, column_mat
     n_rows, n_columns = len(row_match), len(column_match)
     row_degree = [start[r + 1] - start[r] for r in range(n_rows)]
     column_degree = [column_pointer[c + 1] - column_pointer[c] for c in range(n_columns)]
+    # A stack in reversed order, so that the first vertex is taken first.
     # Vertices of degree one: rows as they are, columns after them.
     ready = [n_rows + c for c in reversed(range(n_columns)) if column_degree[c] == 1]
     ready += [r for r in reversed(range(n_rows)) if row_degree[r] == 1]

@@ -47,6 +47,8 @@ def match_highest(incidence: Incidence, least: np.ndarray | None = None) -> np.n
     """A maximum matching of the equations with their highest derivatives, `least` as in `reduce_index`; −1 for
     equations that it leaves out. If it leaves none, no index needs to be reduced."""
     columns = incidence.variable
+    # Only entries at the highest order of their variable count: a matching along these says which equation determines
+    # which highest derivative.
     active = incidence.order == _highest(incidence, least)[columns]
     rows = incidence.rows[active]
     start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=incidence.n_equations))])
@@ -81,6 +83,7 @@ def reduce_index(incidence: Incidence, least: np.ndarray | None = None, matching
     match_variable[match_equation[matched]] = matched
 
     if len(matched) < n_equations or n_equations != n:
+        # Pantelides (1988): the algorithm ends if and only if equations and variables match when orders are ignored.
         whole = maximum_matching(pointer, columns, n)
         if n_equations != n or (whole < 0).any():
             raise StructuralError(f"{n_equations} equations cannot be matched with {n} unknowns")
@@ -94,6 +97,9 @@ def reduce_index(incidence: Incidence, least: np.ndarray | None = None, matching
             )
             if of_equation[equation] != -1:
                 break
+            # No path leads from this equation to a highest derivative that is left. The equations on the way hold fewer
+            # highest derivatives than they are, so each of them hides a constraint: all are differentiated, and their
+            # variables with them.
             for v in seen_variables:
                 d_list[v] += 1
             for e in seen_equations:
@@ -106,6 +112,7 @@ def _augment(root, pointer, columns, sigma, c, d, of_variable, of_equation):
 
     Returns the equations and variables it reached; on success the matching has been changed in place.
     """
+    # Without recursion: in a chain, the path is as long as the model, and Python stops at 1,000 calls.
     came_from: dict[int, int] = {}  # variable -> equation that reached it
     seen_equations = [root]
     position = {root: pointer[root]}
@@ -145,6 +152,8 @@ def diagonal_blocks(signature: Incidence, offsets: Offsets) -> tuple[np.ndarray,
     """The diagonal block of every equation in the system Jacobian, and how many equations that block has."""
     rows, n = signature.rows, signature.n_equations
     active = signature.order + offsets.equation[rows] == offsets.variable[signature.variable]
+    # Equation i depends on the equation that determines each highest derivative in it. Equations that depend on each
+    # other are solved together, and only inside such a block can highest derivatives cancel.
     owner = np.empty(signature.n_variables, np.int64)
     owner[offsets.matched_variable] = np.arange(n)
     follow = (rows[active], owner[signature.variable[active]])

@@ -16,8 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-GROWTH = 100.0  # of an error in a tearing variable, in equilibrated units
-LINKS = 1  # in rows whose growth depends on parameters or the state: they may change after the choice was made
+# An error in a tearing variable may grow so much along the sequence, in equilibrated units.
+GROWTH = 100.0
+# An unknown may follow by so many links whose growth depends on parameters or on the state. These may change after the
+# choice was made.
+LINKS = 1
 EQUILIBRATIONS = 4  # passes: entries need only be alike to a factor that is small beside GROWTH
 
 
@@ -45,6 +48,8 @@ class BlockSizes:
         size = np.stack([self.entries[place] for place in places])
         rows, columns = (np.array(index) for index in zip(*places, strict=True))
         for k in range(EQUILIBRATIONS):
+            # The first pass scales fully, rows and then columns: blocks that differ in units alone come out nearly
+            # equal. The square root of the others keeps rows and columns from undoing each other (Ruiz 2001).
             power = 1.0 if k == 0 else 0.5
             for index in (rows, columns):
                 largest = np.zeros((int(index.max()) + 1, size.shape[1]))
@@ -72,6 +77,8 @@ class _Growth:
             total = total + self.scaled[e, v] * self.growth.get(v, self.one)
             links = max(links, self.links.get(v, 0) + self._depends(e, v, u))
         with np.errstate(divide="ignore", invalid="ignore"):
+            # An unknown is as far off as its terms are together, and never less than a tearing variable: growth that
+            # shrinks along one branch may not pay for a pivot that is too small on the next.
             growth = np.maximum(total / pivot, 1.0)
         if not (growth <= GROWTH).all() or links > LINKS:
             return False
@@ -79,6 +86,9 @@ class _Growth:
         return True
 
     def _depends(self, e: int, v: int, u: int) -> bool:
+        # A ratio of plain numbers up to one cannot grow errors, whatever the parameters become. Every other link may:
+        # the order of elimination is chosen once, and a ladder of 1 Ω resistors may get values over eight decades
+        # afterwards.
         fixed = (e, v) in self.numbers and (e, u) in self.numbers
         return not (fixed and (self.raw[e, v] <= self.raw[e, u]).all())
 
@@ -100,6 +110,8 @@ def tear(
     count = [len(e) for e in equations_of]  # open equations that contain an unknown …
     opened = [0] * n  # … and those of them that it would leave with one solvable unknown
     ready = [e for e in range(n) if _is_ready(left[e], solvable[e])]  # a heap
+    # Entries that are out of date stay in the heap and are skipped when they come up. To look at all unknowns for each
+    # tearing variable would take quadratic time.
     best: list[tuple[int, int, int]] = []  # a heap of (−opened, −count, unknown), some out of date
     sequence: list[tuple[int, int]] = []
     tearing: list[int] = []
@@ -145,6 +157,8 @@ def tear(
                 continue
             (u,) = left[e]
             if growing is not None and not growing.allows(e, u, contains[e] - {u}):
+                # The equation is not used for this unknown any more and becomes a residual, unless another unknown is
+                # left in it.
                 solvable[e] = solvable[e] - {u}
                 continue
             closed = e

@@ -214,6 +214,7 @@ class _Walk:
         points = [(t, v) for t, v in known if v.unit.zero]
         if points:
             unit = points[0][1].unit
+            # One temperature in degC and one in degF: neither zero is that of the sum.
             if any(v.unit != unit for _, v in points):
                 named = [(t.name(), v.unit) for t, v in points]
                 self.found.append(f"{rule}, but {misfit_of_units(named)}")
@@ -221,9 +222,12 @@ class _Walk:
             weight = sum(t.coefficient for t, _ in points)
             start = sum(t.coefficient * v.number for t, v in known if v.is_constant)
             quantities = sum(not v.is_constant for _, v in known)
+            # T + 273.15 converts T to K: the number stands for the zero of the scale and is no term.
             if weight and start and is_close(start * unit.scale, weight * unit.zero):
                 known = [(t, v) for t, v in known if not v.is_constant]  # T + 273.15
             elif is_zero:
+                # The zeros of a scale cancel in T1 − T2. A quantity by itself stands beside numbers, which are on its
+                # scale.
                 cancels = abs(weight) < 1e-9 or quantities == 1
                 if all_known and not cancels and not any(v.is_loose for _, v in known):
                     other = next((t for t, v in known if not v.unit.zero), points[0][0])
@@ -233,6 +237,7 @@ class _Walk:
                     )
                     return None
             elif is_close(abs(weight), 1.0):
+                # A mean such as T1/2 + T2/2 is a temperature on the scale again.
                 zero = unit.zero
         values = [
             (t, dataclasses.replace(v, unit=interval(v.unit), number=abs(v.number * t.coefficient)))

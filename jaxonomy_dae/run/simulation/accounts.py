@@ -66,6 +66,7 @@ def _at_one_time(system: AcausalSystem, t: Time, x: State, inputs: Args) -> Nume
         return system.at(t, inputs).quantities(x, every, np.ones(len(every)))
 
     slots = [_slots(plan, group) for group in plan.flat.accounts]
+    # Derivatives along the field cost a second evaluation of everything, so they are taken only where a term needs one.
     if any(missing.any() for _, _, missing in slots):
         along = (jnp.ones_like(t), system.at(t, inputs).vector_field(x))
         values, slopes = jax.jvp(quantities, (t, x), along)

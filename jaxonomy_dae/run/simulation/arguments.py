@@ -187,6 +187,7 @@ def _check_interval(t0, t1, ts, dtype):
         raise ModelError(
             f"ts must be sorted; ts[{k}]={saved[k]} is followed by ts[{k + 1}]={saved[k + 1]}: use jnp.sort(ts)"
         )
+    # Times are computed, as by `linspace`, and may miss the ends by rounding.
     slack = 1e-6 if np.asarray(ts).dtype == np.float32 else 1e-12
     low = -math.inf if a is None else float(a) - slack * (1 + abs(float(a)))
     high = math.inf if b is None else float(b) + slack * (1 + abs(float(b)))

@@ -82,6 +82,7 @@ def _integrals(solution: Solution, rtol: float, atol: float) -> tuple[np.ndarray
             initial=first, **asked,
         )  # fmt: skip
 
+    # Steps end where inputs and equations have kinks and jumps, so that no piece of the quadrature holds one.
     knots = np.union1d(np.asarray(again(None).ts, float), saved)
     knots = knots[(knots >= saved[0]) & (knots <= saved[-1])]
     places, weights = np.polynomial.legendre.leggauss(POINTS)

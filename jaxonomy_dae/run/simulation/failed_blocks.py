@@ -34,6 +34,7 @@ def failed_block(system: AcausalSystem, first: Instant, last: Instant, t1: Time,
         return _why(system, failed, t, x, inputs, "at the start" if float(t) == float(first[0]) else "there")
     found = _findings(system, t, x, inputs)
     if found:
+        # A block that was as ill-conditioned at the start did not stop the run.
         known = {block.variables for block in _findings(system, *first, inputs)}
         new = [block for block in found if block.variables not in known]
         if new:
@@ -69,6 +70,7 @@ def _first_failed(system: AcausalSystem, t: Time, x: State, inputs: Inputs) -> A
     for step in plan.steps:
         if np.isfinite(values[np.concatenate(step.unknown)]).all():
             continue
+        # All steps before have values, so that a state or an input is lost, and no block is at fault.
         if not np.isfinite(values[step.needs()]).all():
             return None
         return step if step.simultaneous else None
@@ -142,6 +144,7 @@ def _just_beyond(system: AcausalSystem, t: Time, x: State, t1: Time, inputs: Inp
     plan = system.plan
     problem = FlatProblem(term_of(system, implicit=True), x, inputs)
     slope = np.asarray(consistent_slope(problem, None, jnp.asarray(t), jnp.asarray(x))).copy()
+    # Unknowns of blocks begin at their last values, as in a step.
     slope[len(plan.states) :] = 0
     if not np.isfinite(slope).all():
         return ""

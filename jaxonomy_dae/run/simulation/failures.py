@@ -105,6 +105,7 @@ def explain(solution: Solution, at: Stopped, x0: State, implicit: bool, max_even
     system, inputs = solution.system, solution.inputs
     t, x, first = at.t, at.y, (at.t0, x0)
     stopped = f"the integration stopped at t={float(t):g}: "
+    # From what is certain to what is likely: the first explanation that applies is the one that is told.
     of_event = _of_event(solution, at, max_events)
     if of_event:
         return of_event

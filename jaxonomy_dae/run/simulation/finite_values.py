@@ -101,6 +101,7 @@ def _cause(system: AcausalSystem, quantity: int, t: float, x: np.ndarray, inputs
     computed = np.asarray(system.at(jnp.asarray(t), inputs).quantities(jnp.asarray(x), every, np.ones(len(every))))
     values = np.append(computed.astype(float), 0.0)  # the constant zero is −1, the last entry
     of: dict[int, AnyStep] = {int(q): step for step in plan.steps for q in np.concatenate(step.unknown)}
+    # Upstream along values that are not finite, to the step in which the first of them arises.
     while True:
         if quantity not in of:
             return ""

@@ -66,10 +66,13 @@ class SystemProblem(AbstractHybridProblem):
         is_state, is_discrete = plan.state >= 0, plan.table.discrete >= 0
         place = plan.state[is_state]
         new = (values / jnp.asarray(plan.factor, values.dtype))[is_state]
+        # Added rather than set: what does not happen adds zero, and an event leaves other entries with their
+        # derivatives.
         x = x.at[place].add(jnp.where(happens[is_state], new - x[place], 0.0))
         before = q
         place, new = plan.table.discrete[is_discrete], values[is_discrete]
         q = q.at[place].add(jnp.where(happens[is_discrete], new - q[place], 0.0))
+        # An event may take nonlinear blocks to another branch, far from their last solution.
         if len(self.system.plan.carried):
             holding, now, guess, given = still((self.system.holding(q), t, x, args))
             n = len(self.system.plan.states)
@@ -99,6 +102,7 @@ class SystemProblem(AbstractHybridProblem):
         projected = self.system.holding(q).project(t, x, args, iterations=RESTART)
         n, typical = len(plan.states), self.system.typical_sizes[plan.states]
         allowed = CONSISTENT * (jnp.abs(x[:n]) + jax.lax.stop_gradient(typical))
+        # A projection that moves a state farther would decide what the event has left open, or ask for the impossible.
         consistent = jnp.all(jnp.abs(projected[:n] - x[:n]) <= allowed)
         return jnp.where(consistent, projected, jnp.nan)
 

@@ -54,6 +54,7 @@ class _Impact(eqx.Module):
         table, system, t, args = self.held.table, self.system, self.t, self.args
         place, pushes, n = table.impulse, table.closed >= 0, len(system.plan.states)
         closed = table.closed[pushes]
+        # Contacts that do not act part, so that their constraints do not hold while the others push.
         q = self.q.at[closed].set(jnp.where(acting[pushes], self.q[closed], 0.0))
         strength = jnp.where(acting, self.strength, 0.0)
         acts, rate = q.at[place].set(strength), strength * self.e
@@ -98,6 +99,8 @@ class _Impact(eqx.Module):
             pulls = acting & (pushed < -PULL * jnp.max(jnp.abs(pushed)))
             meets = ~acting & (after - (1 - strength) * e < -speed)
             wrong = may_change & (pulls | meets)
+            # One at a time, the first (Murty's rule of least index): exchanging all that are wrong at once may go in
+            # circles.
             first = jnp.arange(n) == jnp.argmax(wrong)
             return jnp.where(wrong & first, ~acting, acting), jnp.any(wrong), count + 1
 

@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ...base.aliases import Args, Controller, Inputs, PyTree, Result, Solver, State, Terms, Time, Times
@@ -84,7 +85,7 @@ class Outcome(eqx.Module):
 
     def numbers(self) -> dict[str, PyTree]:
         """The counts as Python integers."""
-        return {name: int(value) for name, value in self.stats.items() if jnp.ndim(value) == 0}
+        return {name: int(value) for name, value in jax.device_get(self.stats).items() if np.ndim(value) == 0}
 
 
 class _Start(NamedTuple):
@@ -215,6 +216,8 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
             term=term, solver=solver, controller=controller, dt0=dt0, problem=None, y0=x0, saved=_whole,
             admitted=admitted, consistent=consistent, goes_on=admitted, clashes=None,
         )  # fmt: skip
+    # With events, the solver is prepared for the discrete values of each mode, inside the steps
+    # (`SystemProblem.prepared`). So it is wrapped as it was chosen.
     problem = problem_for(system, t0, t1, implicit, watch, tolerance)
     if system.plan.held is not None:
         admitted = admitted & jnp.all(jnp.isfinite(problem.admitted(t0, x0, system.discrete_values, inputs)))
@@ -256,6 +259,7 @@ def _rows(given: Given, begin: _Start, parts: _Parts, done: Run) -> _Rows:
             return now.project_fully(t, y, given.inputs, SAVED_ITERATIONS)
 
         values = None if discrete is None else jnp.where(filled[:, None], discrete, system.discrete_values)
+        # Dense output lies on the constraints to the accuracy of the method only. What users read holds to rounding.
         projected = jax.vmap(projected_onto)(times, safe, values)
         holds = jnp.all(jnp.isfinite(projected), axis=1)
         x = jnp.where(filled[:, None], projected, x)
@@ -282,6 +286,7 @@ def _result(given: Given, parts: _Parts, code: Result, rows: _Rows, consistent: 
         result = diffrax.RESULTS.where(rows.okay & ~parts.goes_on, ENDED, result)
         result = diffrax.RESULTS.where(parts.clashes, CLASH, result)
     result = diffrax.RESULTS.where(consistent, result, failure)
+    # An input that is not finite stops a run as equations without a solution do, and is named as what it is.
     looked_at = diffrax.is_okay(result) | inputs_are_finite(given.inputs, rows.last[0], given.t1)
     return diffrax.RESULTS.where(parts.admitted & looked_at, result, NOT_ADMITTED)
 

@@ -39,6 +39,7 @@ def prepared(
     How far a projection moves counts as an error of the step, so that steps which end where the constraints have no
     solution are rejected. Where steps are not `judged` by their errors, the projection itself must converge.
     """
+    # Only that class itself: one that a user has derived from it may step in another way.
     if type(solver) is diffrax.Tsit5 and watch is not None:
         solver = Tsit5(solver.scan_kind)
     if isinstance(solver, Tsit5) and watch is not None:
@@ -52,10 +53,13 @@ def prepared(
     if system.is_constrained and not implicit:
         return with_projection(solver, project, strict=True, guard=guard)
     if isinstance(solver, BDF):
+        # Saved values are solved for anew, so errors of algebraic unknowns inside of steps do not show.
         if solver.algebraic_errors is None:
             solver = dataclasses.replace(solver, algebraic_errors=False)
         if system.plan.n_projected and solver.projection is None:
             solver = dataclasses.replace(solver, projection=project)
+        # A predictor extrapolates over a branch point of a nonlinear block as if nothing were there. A change of sign
+        # of the determinant shows that.
         if guard is None and system.plan.written_blocks:
             guard = ChoiceGuard(system.block_determinants, atol, ends_near=False)
         return dataclasses.replace(solver, guard=guard)

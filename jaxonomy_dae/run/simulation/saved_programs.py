@@ -82,6 +82,8 @@ def load_compiled(path: str | PathLike[str]) -> Callable:
                 f"load_compiled: '{path}' was made for another {what}{found}. Compile and save it again here, or use "
                 "jax.export"
             )
+    # Kernels outside of XLA, such as those of LAPACK and KLU, are known to it only after whoever calls them was
+    # imported.
     register(told["calls"])
     arguments, results = map(jax.tree.structure, pickle.loads(trees))
     return _loaded(content, arguments, results)

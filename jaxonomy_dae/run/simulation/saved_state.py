@@ -63,6 +63,8 @@ class Memory(eqx.Module):
     def of(cls, problem: AbstractHybridProblem, ts: Times, marks: Numeric, sizes: Numeric) -> "Memory":
         """The memory of the rows saved at `ts`, whose `marks` are the sides of the guards and the counts of ticks."""
         sides, ticks = marks[:, : problem.facts.n_guards], marks[:, problem.facts.n_guards :]
+        # Whether a clock has ticked at the saved time itself: a run that goes on from there must not tick again, nor
+        # leave out a tick that is due.
         since = jnp.abs(jax.vmap(problem.due)(ticks - 1.0) - ts[:, None])
         ticked = (ticks > 0) & (since <= 2 * problem.resolution)
         return jax.lax.stop_gradient(cls(sides, ticked.astype(sides.dtype), sizes))
@@ -72,7 +74,7 @@ class Memory(eqx.Module):
         return Memory(picked(self.sides, slice(rows)), picked(self.ticked, slice(rows)), self.sizes)
 
     def padded(self, ts: Times, steps: Numeric) -> "Memory":
-        """With the rows beyond the steps taken replaced by the last one."""
+        """The memory with the last row in place of the rows beyond the steps taken."""
         sides, ticked = (padded(ts, rows, steps)[1] for rows in (self.sides, self.ticked))
         return Memory(sides, ticked, self.sizes)
 

@@ -316,6 +316,7 @@ class _Call:
 
     def traced(self) -> Solution:
         """The solution inside jit, grad or vmap."""
+        # A program is made once for all values, so that no run can be tried and given up.
         call, why = self, _stiff_without_a_run(self.system.stiffness, self.duration) if self.switches else ""
         if why:
             call = self.implicit(why)
@@ -344,8 +345,10 @@ class _Call:
         """The solution where values are known. Runs are repeated with an implicit solver, or with more room for events,
         if they turn out to need it."""
         call, given, system = self, self.given, self.system
+        # The log is part of the compiled program. With too little room, the run is made again by a second program.
         room = _room_for(_expected_events(system, float(given.t1) - float(given.t0)))
         room = room if room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS else ROOM
+        # Records of 180 and of 200 samples are then one program.
         rows = given if given.ts is None else dataclasses.replace(given, ts=filled_up(given.ts))
         outcome = run_compiled(rows, call.options(room), call.watch(False), begun=call.begun)
         if is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
@@ -357,6 +360,8 @@ class _Call:
                 check(system, outcome.found, given.t0, given.inputs, given.initial, stacklevel=4)
             else:
                 check_state(outcome.found)
+        # Whether a system is stiff depends on its parameters, so it is found by running: explicit steps cost little
+        # until stability limits them.
         if self.switches and self._is_stiff(outcome):
             t = float(outcome.last[0])
             call = self.implicit(f"stiff: stability limits explicit steps from t={t:.3g} on")
@@ -378,6 +383,7 @@ class _Call:
 
     def _is_stiff(self, outcome: Outcome) -> bool:
         """True if stability limited the steps of a run, or would have, had it gone on."""
+        # A run may also use up its steps before so many of them were limited in a row.
         if not is_code(outcome.result, diffrax.RESULTS.max_steps_reached):
             return bool(outcome.is_stiff)
         there = self.system if outcome.held is None else self.system.holding(outcome.held)

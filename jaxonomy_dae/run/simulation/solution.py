@@ -107,6 +107,7 @@ class Solution(eqx.Module):
             return rows[place] if is_traced(k) else picked(rows, place)
 
         row = (..., k, slice(None))
+        # Without events there is no memory: an empty array, with the axes of a batch.
         t, x, none = cut(self.ts, (..., k)), cut(self.states, row), cut(self.states, (..., k, slice(0)))
         if not is_traced(x) and x.ndim == 1 and not np.isfinite(x).all():
             raise ModelError(f"solution.at({int(k)}): the run did not get to t={float(t):g} ({self.result})")
@@ -205,6 +206,7 @@ class Solution(eqx.Module):
         at = list(zip(np.asarray(self.ts, float)[rows].tolist(), np.asarray(some, float), strict=True))
         tolerances = rtol * np.abs(np.asarray(self.states, float)[rows]) + atol
         found = amplified(self.system, names, quantity, factor, np.asarray(values, float), at, tolerances, float(rtol))
+        # What is under the error control is as exact as was asked for.
         found = [one for one in found if one.name not in asked.control]
         if found:
             warnings.warn(sentence(found), RuntimeWarning, stacklevel=5)
@@ -248,6 +250,7 @@ class Solution(eqx.Module):
         if inside is not None:
             values = np.asarray(self.states)[:, inside] * factor.astype(values.dtype)
         elif (quantity >= 0).any():
+            # Filled up, so that a run of a few rows more or less needs no other program.
             ts, states, discrete = filled_up((self.ts, self.states, self.discrete))
             chosen, some = self._evaluated(ts, states, discrete, quantity, factor)
             values = np.asarray(chosen)[: len(self.ts), : len(quantity)]
@@ -430,6 +433,8 @@ def _chosen(system: AcausalSystem, ts, states, inputs, discrete, place, factor, 
         return _held(system, q).at(t, inputs).quantities(x, every, np.ones(len(every)))
 
     rows, some = (ts, states, discrete), _some(ts.shape[0])
+    # Of a small model all quantities are computed at all times, and those that are asked for picked: one program for
+    # all names.
     if owners is None and fit(ts.shape[0], len(every)):
         found = jax.vmap(all_at)(*rows)
         return factor * found[:, place], found[some]

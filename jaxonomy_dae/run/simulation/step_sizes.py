@@ -98,6 +98,7 @@ def first_step(
     """The size of the first step (Hairer, Nørsett & Wanner 1993, II.4), kept out of differentiation."""
     if isinstance(controller, diffrax.StepTo) or not x0.shape[0]:
         return None if isinstance(controller, diffrax.StepTo) else t1 - t0
+    # A controller of the user's need not have tolerances. These are the defaults.
     rtol, atol = getattr(controller, "rtol", 1e-6), getattr(controller, "atol", 1e-8)
     system, x0, inputs, t0, t1 = still((system, x0, inputs, t0, t1))
     scale = atol + rtol * jnp.abs(x0)

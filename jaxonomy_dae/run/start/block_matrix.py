@@ -126,6 +126,7 @@ class Block:
             rows, place = slice(first, first + len(group)), self._columns(group)
             inside = place >= 0
             u, v = left[rows], np.where(inside[..., None], right[place], 0.0)
+            # Null vectors are those of the scaled matrix.
             scales = rank.r[rows, None] * rank.c[place]
             errors = np.where(inside, group.partial_errors(at, known.errors) * scales, 0.0)
             noise += np.einsum("ia,is,isb->ab", np.abs(u), errors, np.abs(v))
@@ -138,6 +139,7 @@ class Block:
             for k in range(ids.shape[1]):
                 moved = list(arguments)
                 moved[moving] = arguments[moving].copy()
+                # What is zero moves by one: a part of zero would be no change.
                 moved[moving][:, k] += MOVED * np.where(unit[:, k] == 0.0, 1.0, unit[:, k])
                 change = np.where(inside, (_partials(own, moved, at) - before) * scales, 0.0)
                 change = np.where(np.isfinite(change), change, np.inf)

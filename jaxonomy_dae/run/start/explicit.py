@@ -96,4 +96,6 @@ def _follow(step: Step, known: dict[int, dict[int, float]]):
             known[own[0]] = _sum([q for q, _ in others], [c for _, c in others], known)
         else:
             read = {u for quantities, _ in terms for q in quantities for u in known.get(q, {})}
+            # A block determines its unknowns by numbers that are not known here, so a row that reads one of them gives
+            # nothing.
             known |= {q: dict.fromkeys(read, np.nan) for q in own}

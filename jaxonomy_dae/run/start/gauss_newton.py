@@ -58,9 +58,12 @@ def judged_at(equations: Equations, search: Search, at: Look) -> tuple[Base, Jud
     balanced = 1 / where(usable, largest, 1.0)
     if equations.has_soft:
         balanced = where(~equations.soft | (sizes.soft == 0), balanced, 1 / sizes.soft)
+    # Rows are weighed once, where a climb begins. Weights that followed the point would change what is to fall, and a
+    # step could lower |F| by them alone.
     weights = weight = where(search.begins, balanced, search.weight)
     if equations.has_soft:  # where guesses outnumber their freedom, all rungs weigh them down
         weights = where(nearest | equations.nearest_first, weight * equations.weights, weight)
+    # Zero times the largest slope is not a number where a slope is not finite: one test serves values and slopes.
     square = xp.sum((weights * value) ** 2 + 0 * largest)
 
     finite = xp.isfinite(square)
@@ -106,6 +109,7 @@ def linear_model(equations: Equations, search: Search, base: Base, judged: Judge
         xp.concatenate([border, equations.array([0.0, 1.0])])[None, :],
         shift * equations.array(np.eye(n + 1, n + 3)),
     ])  # fmt: skip
+    # The right sides stand in the matrix as further columns, so that Q is never formed.
     r = xp.linalg.qr(stacked, mode="raw")[0].T[: n + 1]  # below the diagonal lie the reflections, not read
     both = triangular(r[:, : n + 1], r[:, n + 1 :])
     measured = base.at / xp.append(search.unit, equations.array(1.0))

@@ -62,6 +62,7 @@ def find_root_with(
     )
     x = jax.lax.stop_gradient(found.value) * unit
     value, jacobian = linearized(x)
+    # A solver with loose tolerances ends short of a root, and what counts as one is not the user's to loosen.
     sharper = x - unit * least_squares(weight[:, None] * jacobian * unit[None, :], weight * value)
     x = jnp.where(jnp.all(jnp.isfinite(sharper)), sharper, x)
     value, jacobian = linearized(x)

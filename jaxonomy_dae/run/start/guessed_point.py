@@ -73,6 +73,8 @@ def guessed_point(
         weight = weights(scaled, starts & counts)
         x = inside(x - unit * _least_squares(xp, weight[:, None] * scaled, weight * at.value))
         at = look(x)
+    # Rows are weighed where starts have been met. At the start of the search, slopes of a linkage that is not assembled
+    # yet may be far from those at a solution.
     weight = weights(at.jacobian * unit, counts)
 
     def rows(x: Numbers) -> tuple[Numbers, Numbers]:

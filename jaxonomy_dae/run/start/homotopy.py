@@ -36,6 +36,8 @@ def followed(equations: Equations, search: Search, here: Numbers, judged: Judged
     landing, length, stretch = search.rung == Rung.LAND, linear.length, linear.stretch
     unit = xp.append(search.unit, equations.array(1.0))
 
+    # The null vector of a Jacobian has no sign. At the start the curve is followed towards s = 1; later the last
+    # tangent, which is a row of the matrix, gives the sign.
     turned = where(fresh & ((linear.tangent[n] < 0) ^ (old.turn < 0)), -1.0, 1.0)
     tangent = linear.tangent * (turned / stretch)
     on_curve = finite & (stretch < xp.inf) & (fresh | (length <= CLOSE * xp.minimum(old.arc, 1.0)))
@@ -44,6 +46,8 @@ def followed(equations: Equations, search: Search, here: Numbers, judged: Judged
     # A correction past s = 1, from a prediction before it, would miss the root: a shorter arc lands.
     passed = on_curve & ~fresh & ~landing & ((corrected[n] - 1) * (base[n] - 1) < 0)
     on_curve &= ~passed
+    # A correction that is not half as long as the last one does not converge: it may lead to another branch of the
+    # curve.
     reach = where(old.corrections == 0, old.arc, 0.5 * old.corrected)
     correcting = finite & ~on_curve & ~passed & (old.corrections < CORRECTIONS) & (length <= reach)
     landed, passes = on_curve & landing, on_curve & ~landing

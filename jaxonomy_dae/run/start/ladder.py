@@ -108,6 +108,7 @@ def find_root(
     limits, xp, unit = None, namespace(start), None
     if bounds is not None and np.isfinite(bounds).any():
         limits = xp.asarray(bounds[:, 0], start.dtype), xp.asarray(bounds[:, 1], start.dtype)
+    # Typical sizes are powers of two, so that scaling rounds nothing and leaves zeros and equal numbers what they are.
     if typical is not None:
         unit = jax.lax.stop_gradient(typical) if xp is jnp else typical
         sizes = sizes._replace(nominal=sizes.nominal / unit, known=sizes.known / unit)
@@ -145,6 +146,8 @@ def _climb(equations: Equations) -> Found:
     unit = column_sizes(terms_of(at.value, at.terms), at.jacobian, sizes)
     size, noise = row_sizes(weighed(at.jacobian), start, sizes, unit, at.terms)
     stays = xp.all(xp.abs(at.value) <= close(dtype) * size) & xp.all(xp.isfinite(at.jacobian))
+    # An unknown without a size on which nothing depends may be at a point where its slope vanishes, as of q·|q| at
+    # zero: there the equations hold for any size, and its size has to be found first.
     stays &= xp.all((sizes.known > 0) | xp.any(at.jacobian != 0, axis=0))
     search = _begun(equations, at.jacobian, unit, solved(dtype) * size + noise, stays)
     search = loop(lambda search: search.rung < Rung.DONE, lambda search: _advanced(equations, search), search)
@@ -207,11 +210,14 @@ def _next(
     """What comes next: another step, another rung, another climb, or the end."""
     rung, count, begins, first = search.rung, search.count, search.begins, int(equations.first_rung)
     going, nearest = ~sized.goes_on, rung == Rung.NEAREST if equations.has_soft else np.False_
+    # A start that is not finite is no failure of a rung: points around it are tried, so that a logarithm of zero does
+    # not end the search.
     lost = going & begins & ~(judged.finite & (~nearest | down.determined))
     steps_off = lost & (count < STEPS_OFF)
     fails = down.fails if curve is None else where(search.tracking, curve.fails, down.fails)
     stop = judged.reached & going
     failed = going & ~stop & ~down.settled & ~steps_off & (fails | (search.fresh & ~judged.finite))
+    # A method that cannot lower |F| any more has arrived if all that is left is rounding.
     rounded = failed & base.holds & ~nearest & ~search.fresh
     stepped, foot, landed, follow = down.trial, base.at, np.False_, rung
     if curve is not None:
@@ -244,6 +250,7 @@ def _next(
         evaluations=search.evaluations + 1,
         trial=ahead,
         start=start,
+        # Where all rungs fail, the point where descent ended tells most about what does not hold.
         best=where((rung == Rung.MARQUARDT) & failed, base.at, search.best),
         base=base._replace(at=at, jacobian=where(sized.goes_on, sized.slopes, base.jacobian)),
         descent=down.descent,

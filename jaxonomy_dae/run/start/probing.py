@@ -43,6 +43,7 @@ def probed(equations: Equations, search: Search, at: Look) -> Probed:
     slopes, before = xp.abs(jacobian), xp.abs(search.base.jacobian)
     comparable = flat[None, :] & last & (slopes > 0) & (before > 0) & xp.isfinite(before)
     growth = xp.log(where(comparable, before / slopes, 1.0)) / float(np.log(PROBES[0] / PROBES[1]))
+    # A slope that grows as the p-th power belongs to a term of one power more.
     power = 1 + xp.clip(growth, 0, 8)
     known = where(first, jacobian, where(flat[None, :] & ~last, jacobian, search.base.jacobian))
     implied = column_sizes(where(equations.soft, 0.0, value), known / power, sizes, power)

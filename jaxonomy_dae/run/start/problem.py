@@ -27,7 +27,8 @@ from .rows import InitialRows, StartRow, initial_rows
 from .search import Look
 from .sizes import Sizes
 
-PERTURBATIONS = 8  # of the start, and of parameters, that show the sizes of terms
+# Patterns of small changes of the start and of parameters, which show how large terms are.
+PERTURBATIONS = 8
 
 
 class InitialProblem:
@@ -73,6 +74,7 @@ class InitialProblem:
         self.moving = parameters, inputs, self.target
         self.settings = frozen(parameters), frozen_inputs(inputs), frozen(self.target)
         self.full = jnp.concatenate([jnp.zeros((self.n_equations,), dtype), self.target])
+        # Rows that must hold come first, guesses last: everything below reads them by this order.
         self.is_soft = np.arange(self.m) >= self.m - rows.n_soft
         self.excused = None
         if rows.direct:
@@ -84,6 +86,7 @@ class InitialProblem:
         self.start = frozen(jnp.append(self.x0, parameters[self.unknown]) if len(more) else self.x0)
         nominal = jnp.append(self._nominal, jnp.asarray(more, dtype))
         guess = jnp.append(sizes[kept:] * jnp.abs(units), jnp.asarray(more, dtype))
+        # The largest of what is known: a guess of zero for a pressure says nothing of its size, its nominal value does.
         known = jnp.maximum(jnp.maximum(guess, jnp.abs(self.start)), nominal)
         # A guess that is rounding, as π − 3.14159…, says nothing of a size.
         known = jnp.where((known > 0) & (known <= KNOWN * self.typical), self.typical, known)
@@ -92,6 +95,8 @@ class InitialProblem:
         if self.m > len(self.start):
             self.sizes = frozen(_with_velocities(self.sizes, self.start[: plan.n_state], plan, system.at(t0, inputs)))
         state = {int(q) for q in entries}
+        # Only rows of variables outside of the state can be rounding errors and nothing else: an entry of the state is
+        # an unknown itself. Where no row is redundant, there is none to give way to it.
         read = [self.n_equations + k for k, row in enumerate(rows.kept) if row.quantity not in state]
         if read and rows.redundant and not rows.n_soft:
             typical = _typical_of_rows(self.point, rows, self.n_equations, read)
@@ -107,6 +112,7 @@ class InitialProblem:
         parameters, inputs, target = moving
         here, x = self._at(parameters, inputs, w), w[: self.plan.n_state]
         if len(self.unknown):
+            # Starts may be expressions in a parameter that is solved for, such as a release angle.
             target, _ = start_values(self.rows.kept, self._given, here.parameters)
         parts = [here.constraint_vector(x)]
         if len(self.plan.carried):
@@ -175,6 +181,7 @@ def guessed_from(plan: SystemPlan, rows: InitialRows, look: Any, start: Any, typ
     """As `guessed_point`, of rows that end with `rows.hints`."""
     n_equations, n_more = plan.n_constraints + len(plan.carried), len(start) - plan.n_state
     is_start = np.append(np.zeros(n_equations, bool), np.ones(len(rows.kept) + len(rows.hints), bool))
+    # Zeros that nobody wrote must not choose between solutions.
     undeclared = [k for k, row in enumerate(rows.kept, n_equations) if row.start is None and row.given < 0]
     counts = np.ones(len(is_start), bool)
     counts[undeclared] = False
@@ -221,6 +228,8 @@ def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, 
     def rows(w, parameters):
         return residual(w, (parameters, inputs, target))
 
+    # Changes of all arguments at once, with several patterns of signs: one alone may let two terms cancel, and a
+    # direction for each argument would take as many derivatives as there are arguments.
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (PERTURBATIONS, len(start) + len(parameters)))
     moves, changes = np.split(signs, [len(start)], axis=1)
     size = jnp.maximum(jnp.abs(start), sizes.known)

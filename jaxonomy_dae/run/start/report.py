@@ -285,7 +285,9 @@ class InitializationReport(Sections):
 
     def _examine(self):
         with jax.ensure_compile_time_eval():
-            yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read, SUSPICIOUS)
+            # Those of a system whose parameters were solved for belong to the values before.
+            sizes = None if self.solved else np.asarray(self._system.typical_sizes, float)
+            yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read, sizes, SUSPICIOUS)
 
     def _numbers(self) -> tuple[np.ndarray, tuple]:
         """All parameters, those solved for included, and the networks' weights."""
@@ -471,7 +473,7 @@ class InitializationReport(Sections):
 
 @remembered
 def _guessed(plan: SystemPlan, names: tuple[str, ...], unknown: tuple[int, ...]) -> tuple[np.ndarray, ...]:
-    """Of what the model integrates and nothing fixes, declared guesses: places in the state array, quantities,
+    """The declared guesses of what the model integrates and nothing fixes: places in the state array, quantities,
     variables, and the variables' factors."""
     rows = initial_rows(plan, names, unknown)
     held = {row.quantity for row in rows.kept[: len(rows.kept) - rows.n_soft]}

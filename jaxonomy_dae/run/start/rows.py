@@ -133,6 +133,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
     inside = set(plan.states.tolist())
     rows = [*overrides, *fixed]
     others = [started[q] for q in sorted(started.keys() - {*entries, ZERO})]
+    # Questions of rank cost a decomposition. Where states are free and starts are states, there is nothing to ask.
     free = not plan.n_constraints and not len(plan.carried) and not solve_for
     ranks = _ranks(plan, guess, others) if others or not free else None
     if free and all(r.quantity in inside for r in rows) and (ranks is None or _are_states(ranks, inside)):
@@ -202,6 +203,8 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     n = extended.quantities.n_unknown
     size = declared_scale(plan.model)
     n_parameters = len(plan.flat.parameters)
+    # Rank is asked at a generic point: at the declared starts, a derivative that happens to vanish there, as of a
+    # pendulum at its lowest point, would make a row look dependent.
     parameter_size = np.ones(n_parameters)
     if n <= DECOMPOSED_UPTO:  # parameters, as generic numbers, would make some equations stiff beside others
         none = np.zeros(n_parameters)
@@ -256,6 +259,7 @@ def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray
 
                 tangent = [jnp.asarray(h, p.dtype) for h, p in zip(hit.T, given, strict=True)]
                 out[group.equation, j] = np.asarray(jax.jvp(residual, (given,), (tangent,))[1])
+    # What is not real at the generic point depends on the parameter all the same.
     return np.where(np.isfinite(out), out, 1.0)
 
 
@@ -279,6 +283,8 @@ def _ranks(plan: SystemPlan, guess: Sequence[StartRow | None], others: Sequence[
     ]
     states = set(plan.states.tolist())
     return [
+        # Guesses of what the model integrates count first whichever of them became states: that depends on the order of
+        # declaration and on what else is asked of the model.
         _Rank(tuple(row for row in declared if inside[row.quantity]), True),
         _Rank(tuple(row for row in declared if not inside[row.quantity]), True),
         _Rank(tuple(row for row in zeros if row.quantity in states), False),
@@ -349,6 +355,7 @@ class _Directions:
 def _by_rank(plan: SystemPlan, generic: _Generic, hard: Sequence[StartRow], ranks: Sequence[_Rank]) -> _Judged:
     """The choice of rows for few quantities: each closes a direction that those before it leave open, or none."""
     directions = _Directions(generic)
+    # Asked before any row closes a direction: these follow from the equations alone, and not from other starts.
     follows = [not directions.open(generic.row(row)) for row in hard]
     closes = [directions.close(generic.row(row)) for row in hard]
     soft: list[tuple[StartRow, bool]] = []
@@ -356,6 +363,8 @@ def _by_rank(plan: SystemPlan, generic: _Generic, hard: Sequence[StartRow], rank
     held, order = {row.quantity for row in hard}, plan.extended.quantities.order
     for rank in ranks:
         gradients = [generic.row(dataclasses.replace(row, start=None)) for row in rank.rows]
+        # All guesses of a rank are asked before one of them closes a direction. Otherwise the first of two that share a
+        # freedom would hold, and the other would not count: the order of declaration would decide.
         undecided = [directions.open(gradient) for gradient in gradients]
         for row, gradient, is_open in zip(rank.rows, gradients, undecided, strict=True):
             alone = is_open and directions.close(gradient)
@@ -380,6 +389,8 @@ def _by_matching(plan: SystemPlan, generic: _Generic, hard: Sequence[StartRow], 
     gradients = generic.rows([*hard, *(dataclasses.replace(row, start=None) for row in guesses)])
     pointer = np.concatenate([generic.jacobian.indptr, generic.jacobian.nnz + gradients.indptr[1:]])
     columns = np.concatenate([generic.jacobian.indices, gradients.indices]).astype(np.int64)
+    # Matching tells which rows are independent for almost all numbers, in a time near the size of the model. What the
+    # numbers at hand say otherwise is found by `_exchanged`.
     column = match_in_order(pointer, columns, n_columns, n_equations)
     shares = _sharing(pointer, columns, column, n_equations + n, ranks, n_columns)
     matched, settled, unshared = column[n_equations:] >= 0, np.zeros(0, np.int64), np.zeros(len(guesses), bool)
@@ -449,7 +460,8 @@ def _exchanged(generic: _Generic, gradients: Any, chosen: np.ndarray, hard: int)
 
 
 def _weights_of(rank: Any, gradients: Any, n_equations: int) -> np.ndarray:
-    """Of which chosen rows, beside the equations, other rows are combinations, shape (rows, chosen)."""
+    """True where a chosen row has a part in another row, as a combination of chosen rows and equations; shape (rows,
+    chosen)."""
     out = np.zeros((gradients.shape[0], len(rank.r) - n_equations), bool)
     for k in range(gradients.shape[0]):
         weight = np.abs(rank.factors.solve(gradients[[k]].toarray()[0] * rank.c, trans="T"))

@@ -76,7 +76,7 @@ class Equations:
 
     @property
     def dtype(self) -> np.dtype:
-        """Of all numbers."""
+        """The type of all numbers."""
         return self.origin.dtype
 
     @property

@@ -58,6 +58,7 @@ def _plan_check(plan: SystemPlan) -> _Check:
             examined.add(k)
             wanted[step.needs()[step.needs() != ZERO]] = True
             continue
+        # These are nearly all steps of a model, and nothing of them can be singular.
         if len(step.unknown) == 1 and all(_never_vanishes(e) for e in step.equations):
             continue
         examined.add(k)
@@ -68,6 +69,7 @@ def _plan_check(plan: SystemPlan) -> _Check:
     settled = plan.selection.settled
     for planned in plan.constraints:
         wanted[settled[np.isin(settled, planned.equation.quantity)]] = True
+    # Backwards, since what a step needs is computed by those before it.
     for k in reversed(range(len(plan.steps))):
         step = plan.steps[k]
         if any(wanted[q].any() for q in step.unknown):
@@ -90,6 +92,7 @@ def examine_blocks(
     t: float,
     x,
     inputs: Callable[[], np.ndarray],
+    sizes: np.ndarray | None = None,
     limit: float = ILL_CONDITIONED,
 ) -> Iterator[BlockFinding]:
     """The blocks that are singular at a state, or ill-conditioned, in the order they are solved; the first singular
@@ -99,6 +102,7 @@ def examine_blocks(
 
     - `parameters`, `x`: flat arrays.
     - `inputs`: a function that gives the values of the inputs' quantities; called only if there are any.
+    - `sizes`: the typical sizes of all quantities, where the caller has them.
     - `limit`: the condition number from which on a block is reported.
     """
     check = _plan_check(plan)
@@ -110,7 +114,8 @@ def examine_blocks(
     if quantities.n > quantities.n_unknown:
         values[quantities.n_unknown :] = inputs()
     parameters = np.asarray(parameters, float)
-    known = Known(Point.of(values, parameters, t, Networks(networks)), typical_sizes(plan.model, parameters))
+    sizes = typical_sizes(plan.model, parameters) if sizes is None else sizes
+    known = Known(Point.of(values, parameters, t, Networks(networks)), sizes)
     for k, step in enumerate(plan.steps):
         if k not in check.examined | check.solved:
             continue
@@ -134,6 +139,8 @@ def examine_blocks(
                 if not rank.is_regular:
                     return
             if step.whole and not step.carried:
+                # Behind a block that is solved, others are judged at its solution, for their coefficients may depend on
+                # it.
                 known.put(block.unknown, rank.solve(-block.residual(known)))
     yield from _constraints(plan, known)
 
@@ -167,6 +174,7 @@ def _follow(step: Step, known: Known):
 def _solve(step: Step, known: Known):
     """Computes the unknowns of a linear step."""
     for quantities in step.unknown:
+        # At zero the residual of a linear step is its right-hand side.
         known.put(quantities, 0.0)
     residual = np.stack([equation.residual(known.at) for equation in step.equations], axis=-1)
     try:

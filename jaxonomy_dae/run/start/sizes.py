@@ -73,6 +73,8 @@ def column_sizes(value: Numbers, jacobian: Numbers, sizes: Sizes, power: Numbers
     magnitude = xp.where(xp.isfinite(jacobian), xp.abs(jacobian), 0)
     offset = xp.maximum(sizes.data, xp.where(xp.isfinite(value), xp.abs(value), 0))
     size = sizes.known
+    # Sizes of unknowns follow from rows, and those of rows from unknowns that have a size: the second round reaches
+    # rows in which nothing was known before.
     for _ in range(2):
         terms = magnitude * (size[None, :] if power is None else size[None, :] ** power)
         row = xp.maximum(offset, xp.max(terms, axis=1, initial=0.0))

@@ -112,6 +112,7 @@ def sparse_newton(
         value, values = jax.lax.stop_gradient((function(x), jacobian(x)))
         size, noise = sizes_of_rows(x, values)
         weight = jnp.where(least < jnp.inf, weight, largest(values))
+        # Redundant rows fall with those they follow from, and would only weigh them twice.
         merit = jnp.sqrt(jnp.sum((weight * value)[rows.core] ** 2))
         inside = jnp.all((x >= low) & (x <= high))
         holds = inside & jnp.all(jnp.abs(value) <= close * size + noise)

@@ -115,6 +115,8 @@ class AcausalCompiler:
 
     def __call__(self) -> AcausalSystem:
         flat, added = run_passes(flatten(self.diagram), self._added)
+        # After the user's passes and flattening: a model that is not well formed has an error of its own, which says
+        # more.
         if self.check_units:
             check_units_of(self.diagram)
         model = compile_flat(flat, self.state_selection, self.prefer_states)

@@ -32,6 +32,7 @@ def project(
     for sign, at in ((-1, "low"), (1, "high")):
         bound, opened = end(sign, at)
         bound = jnp.asarray(bound, new.dtype)
+        # Where there is no open end the difference is zero: an infinite one would leave not-a-number in gradients.
         limit = jnp.where(opened, bound + jnp.asarray(KEPT, new.dtype) * (old - jnp.where(opened, bound, old)), bound)
         new = jnp.maximum(new, limit) if sign < 0 else jnp.minimum(new, limit)
     return new

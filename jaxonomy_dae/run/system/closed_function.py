@@ -93,6 +93,7 @@ def _with_numbers_lifted(jaxpr: Any) -> tuple[Any, list[Any]]:
     if not lifted:
         return jaxpr, []
     structs = [jax.ShapeDtypeStruct(atom.aval.shape, atom.aval.dtype) for atom in lifted]  # pyright: ignore
+    # JAX has no public way to make a variable of a jaxpr. Tracing the identity makes some.
     fresh = jax.make_jaxpr(lambda *values: values)(*structs).jaxpr.invars
     name = {id(atom): variable for atom, variable in zip(lifted, fresh, strict=True)}
 

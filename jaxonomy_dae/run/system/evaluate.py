@@ -66,6 +66,7 @@ class Evaluation(Values):
         matrix: dict[tuple[int, int], Scalar] = {}
         right = []
         shape = () if planned.step.n == 1 else (planned.step.n,)
+        # Python's zeros, so that products with unknowns are left out of the residual while the program is traced.
         blank = [0.0] * len(planned.step.unknown)
         for e, equation in enumerate(planned.equations):
             rest, slopes = self._affine_parts(equation, blank)
@@ -114,6 +115,7 @@ class Evaluation(Values):
 
         def repetition(carried, given):
             outside, parameters = given
+            # A memory of its own: what networks remember are tracers of this iteration, which must not leave it.
             inner = Evaluation(carried, outside, parameters, self.t, Networks(self.networks.weights), self.typical)
             for step in planned.body:
                 inner.chunks.extend(inner.step(step, Refinement.NONE))
@@ -122,6 +124,8 @@ class Evaluation(Values):
             return carried, tuple(inner.chunks[2:])
 
         count = planned.count
+        # One gather for all repetitions. Inside the scan, each would gather from all parameters, and backwards scatter
+        # into an array of their length.
         parameters = self.parameters[planned.parameters.ravel()].reshape(planned.parameters.shape)
         given = jnp.reshape(read(planned.outside), (count, -1)), parameters
         _, chunks = jax.lax.scan(repetition, read(planned.first), given, unroll=UNROLLED_REPETITIONS)

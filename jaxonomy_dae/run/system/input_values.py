@@ -73,6 +73,7 @@ def input_values(plan: SystemPlan, given: Mapping[str, Any] | None, t: Any, dtyp
         if places is not None:
             put(source, places.ravel())
             without[places] = False
+    # Inputs of one default are put at once: an operation for each would be as many as there are inputs.
     for default in dict.fromkeys(table.defaults[k] for k in np.flatnonzero(without).tolist()):
         put(default, np.array([k for k in np.flatnonzero(without).tolist() if table.defaults[k] == default]))
     if n > SCALARS:

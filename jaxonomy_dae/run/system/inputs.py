@@ -159,6 +159,7 @@ def _constant(name: str, value: Any, dtype: Any) -> Any:
     if isinstance(value, str):
         raise ModelError(f"input '{name}' must be a number, samples or a function of time; got the text {value!r}")
     try:
+        # By NumPy where the value is known, since JAX would compile a program for the conversion.
         array = jnp.asarray(value) if is_traced(value) else np.asarray(value)
         if array.dtype.kind not in "biufcV":  # V: numbers of eight bits and the like
             raise TypeError
@@ -248,6 +249,7 @@ def _column(name: str, which: str, values: Any, dtype: Any, shape: tuple[int, ..
         index = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
         where = ", ".join(map(str, index))
         raise ModelError(f"input '{name}': {which}[{where}] is {array[index]}; leave the sample out")
+    # A copy: JAX may share memory with NumPy's array, to which its owner may write later.
     return jnp.array(array, dtype, copy=True)
 
 

@@ -115,6 +115,8 @@ class AbstractBlock(abc.ABC, Generic[_P]):
         z = self.guess
         if refine is Refinement.ONCE:
             inside = self.at(self.corrected(z))
+            # One correction at a stage brings the unknowns to what a step needs. Rounding is asked for where values are
+            # read and at saved times.
             holds = self.holds(self.beside(inside), ROUGH)
         else:
             tolerated, batch = solved(self.dtype), () if self.whole else jnp.shape(z[0])
@@ -123,6 +125,8 @@ class AbstractBlock(abc.ABC, Generic[_P]):
             )
             inside = self.at(z)
         nan = jnp.full_like(inside.chunks[0], jnp.nan)
+        # Not-a-number rather than the last iterate: a loud failure, which rejects the step, instead of a value that
+        # looks like a solution.
         return [jax.lax.select(holds, u, nan) for u in inside.chunks]
 
 

@@ -269,6 +269,8 @@ class Parameters(eqx.Module):
             else:
                 value = self._checked(int(entries), value, batch)
             given[name] = value
+        # Inside of jit the operations join the program around them. Under `grad` and `vmap` alone JAX would run them
+        # one by one, so they are a program. Values that are known are set by NumPy.
         if is_staged((array, given)):
             array = _with_values(self.table, array, given)
         elif is_traced((array, given)):

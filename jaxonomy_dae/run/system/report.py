@@ -58,6 +58,8 @@ class SystemReport(Sections):
         counts = np.bincount(extended.base, minlength=1) - 1
         quantities = extended.quantities
         algebraic = (quantities.highest[: quantities.n_unknown_columns] == 0).any()
+        # Where highest derivatives cancel, equations were combined, and differentiated more often than the structure of
+        # those that were written asks for.
         return max(self._offsets.structural_index, int(counts.max(initial=0)) + int(algebraic))
 
     @property

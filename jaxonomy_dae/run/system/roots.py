@@ -19,7 +19,7 @@ SURE = 1e-6  # residuals so small, relative to their terms at the start, need no
 
 
 class Beside(NamedTuple):
-    """What a residual counts as zero beside.
+    """The sizes beside which a residual counts as zero.
 
     - `terms`: the magnitude of its terms.
     - `typical`: Σ |∂r/∂s|·size(s) over all that stands in the equation, with typical sizes.
@@ -86,16 +86,23 @@ def find_root(
         least, sizes = memory
         residuals, step = stepped(z)
         holds, own = judged(z)
+        # Sizes stay those at the start: beside the terms of each iterate, a residual would seem to fall where only the
+        # terms grow.
         sizes = [jnp.where(least == jnp.inf, a, b) for a, b in zip(own, sizes, strict=True)]
         off = [jnp.abs(r) / jnp.where(s > 0, s, 1) for r, s in zip(residuals, sizes, strict=True)]
         largest = functools.reduce(jnp.maximum, off)
+        # A block that stays whole has one verdict for all of its equations.
         largest = jnp.max(largest) if len(batch) < jnp.ndim(largest) else largest
+        # A decrease in proportion to the part of the step that is tried (Armijo 1966): with a mere decrease, ever
+        # smaller gains would do, and the search could stop where no equation holds.
         falls = (largest <= (1 - part / 4) * least) | (least <= SURE)
         return Tried(falls, holds, step, (largest, sizes))
 
     begin = jnp.full(batch, jnp.inf, z[0].dtype), [jnp.zeros_like(r) for r in jax.eval_shape(stepped, z)[0]]
     found = newton(look, z, begin, NEWTON_STEPS, batch=batch)
     z = jax.lax.stop_gradient(found.x)
+    # The root is held constant. One step from it has the first derivatives of the solution, a second one the second
+    # derivatives.
     for _ in range(2):
         z = differentiable(z)
     return z, jnp.asarray(found.holds)

@@ -107,6 +107,7 @@ def fastest_decay(model: ReducedModel, parameters: np.ndarray) -> float:
         return 0.0
     found: Any = _fast_rates(matrix, below)
     found = found[np.abs(found) > RANK * np.abs(found).max(initial=0.0)]  # an oscillator's zero is no decay
+    # Fast oscillations have to be followed by any solver: an implicit one would gain nothing.
     decays = -found.real[-found.real > np.abs(found.imag)]
     return float(decays.max(initial=0.0))
 
@@ -135,8 +136,8 @@ def _fast_rates(matrix: Any, below: np.ndarray) -> np.ndarray:
 
 
 def _free(matrix: Any, below: np.ndarray) -> np.ndarray:
-    """Of the quantities `below`, as many as the equations leave free: all, or those that the matching of equations to
-    quantities by large entries of their Jacobian passes over (as weights by Duff & Koster 2001)."""
+    """As many of the quantities `below` as the equations leave free: all of them, or those that a matching of equations
+    to quantities by large entries of the Jacobian passes over (weights as by Duff & Koster 2001)."""
     m, n = matrix.shape
     if m == n - len(below):
         return below

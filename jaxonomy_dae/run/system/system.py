@@ -150,6 +150,8 @@ class AcausalSystem(eqx.Module):
         if known is None or is_traced(self.typical_sizes):
             return self.typical_sizes
         sizes = typical_sizes(plan.model, plan.flat.parameters.everything(known))
+        if np.array_equal(sizes, self.typical_sizes):  # nearby values have the same
+            return self.typical_sizes
         with jax.ensure_compile_time_eval():
             return jnp.asarray(sizes, self.typical_sizes.dtype)
 
@@ -366,6 +368,7 @@ class AcausalSystem(eqx.Module):
             )
         point = self.at(t, args)
         if len(self.plan.carried):
+            # The unknowns of nonlinear blocks are refined, and entries stay derivatives by the state that was given.
             x = jax.lax.stop_gradient(point.refined(x, Refinement.ROOT)) + (x - jax.lax.stop_gradient(x))
         return SparseMatrix(sparse_jacobian(point.vector_field, pattern)(x), pattern)
 
@@ -379,6 +382,8 @@ class AcausalSystem(eqx.Module):
         if not self.plan.n_projected:
             return self.project(t, x, args, iterations)
         near = self.project(t, x, args, iterations - 1)
+        # Judged by the last step rather than by residuals: these have units, and the length of a step is that of the
+        # states.
         found = self.project(t, near, args)
         short = jnp.abs(found - near) <= CONSISTENT * (jnp.abs(found) + self.state_sizes)
         return jnp.where(jax.lax.stop_gradient(jnp.all(short)), found, jnp.nan)
@@ -440,6 +445,7 @@ class AcausalSystem(eqx.Module):
         if is_staged((self, t, x, args)):
             values = self.at(t, args).quantities(x, quantity, factor)
             return values[0] if single else values
+        # Padded to a power of two, so that reading three variables and reading four are one program.
         n, dtype = 1 << (len(quantity) - 1).bit_length(), self.parameters.values.dtype
         padded = on_device(np.resize(quantity, n)), on_device(np.resize(factor, n), dtype)
         values = _observed(dataclasses.replace(self, stiffness=None), on_device(t, dtype), on_device(x), args, *padded)

@@ -66,6 +66,7 @@ class SystemAt:
         """The state as a tuple of scalars, if it is one or has up to `SCALARS` entries; else as an array."""
         if isinstance(x, tuple):
             return x
+        # A program reads the state at several places. Split once, its cotangents are joined once, too.
         if self._last is None or self._last[0] is not x:
             array = jnp.asarray(x)
             if jnp.shape(array) != (self.plan.n_state,):
@@ -95,8 +96,10 @@ class SystemAt:
         plan = self.plan
         if not len(plan.carried):
             return self._array(self._slopes(x)[0])
+        # The algebraic unknowns of a stage are extrapolated by the method, and lie off their equations by its error.
         x = self.refined(x, Refinement.ONCE)
         slopes, evaluation = self._slopes(x)
+        # Where index reduction has differentiated the equations of these unknowns, their rates are quantities already.
         if plan.carried_rates is not None:
             return self._array(slopes, self._values(evaluation, plan.carried_rates))
         return self._array(slopes, self._carried_rates(x, slopes))
@@ -143,6 +146,7 @@ class SystemAt:
             return jax.jvp(self.carried_vector, (self.t, self._chunk(x)), (jnp.ones_like(self.t), moved))[1]
 
         if plan.carried_pattern is None:
+            # Affine in the rates, so that one Newton step from zero solves it.
             _, rates = newton_step(lambda rates: entries(along(tuple(rates))), [jnp.zeros((), self.dtype)] * m)
             return tuple(rates)
         matrix = sparse_jacobian(lambda z: self.carried_vector(self.t, jnp.append(x[:n], z)), plan.carried_pattern)(
@@ -205,6 +209,7 @@ class SystemAt:
             pattern = SparsePattern(rows, cols, plan.n_state, n_rows=m)
             jacobian = pattern.dense(sparse_jacobian(g, pattern)(x))
         else:
+            # Reverse mode takes a pass for each row, which costs more than a pass of forward mode for a column.
             jacobian = (jax.jacrev if 4 * m < n else jax.jacfwd)(g)(x)
         jacobian = jacobian * jnp.asarray(plan.nominal, self.dtype)
         size = jnp.sqrt(jnp.sum(jacobian**2, axis=1, keepdims=True))
@@ -308,6 +313,7 @@ class SystemAt:
         least (nominal-weighted) norm, and the tearing variables of nonlinear blocks refined."""
         plan = self.plan
         x = jnp.asarray(x)
+        # Several steps of a large model stand in the program once.
         if plan.n_projected and iterations > 1 and is_large(self._least_norm_step, x):
             x, _ = jax.lax.scan(lambda x, _: (self._least_norm_step(x), None), x, length=iterations)
         else:
@@ -323,6 +329,7 @@ class SystemAt:
         if plan.n_state <= SCALARS and plan.n_constraints <= UNROLLED and plan.held is None:
             return self._least_norm_of_few(self._chunk(x))
         nominal = jnp.asarray(plan.nominal[:n], self.dtype)
+        # Rows by reverse mode: there are fewer constraints than states.
         value, pull = jax.vjp(self.projected_onto, x)
         jacobian = jax.vmap(lambda e: pull(e)[0])(np.eye(len(value), dtype=self.dtype))[:, :n] * nominal
         # Each constraint in units of its gradient: multiplied by 1e9 it is projected onto alike.

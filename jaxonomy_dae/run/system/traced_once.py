@@ -38,6 +38,8 @@ class TracedOnce:
                 return method(remade(*own), *given)
 
             evaluate.__name__ = evaluate.__qualname__ = getattr(method, "__name__", "evaluate")
+            # One function object for each method, since JAX keeps traces by it. What is static of the arguments is part
+            # of the key.
             self._calls[method] = jax.jit(evaluate, static_argnums=(0, 1))
         return self._calls[method](tuple(leaves), structure, arrays)
 

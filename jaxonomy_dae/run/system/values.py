@@ -96,6 +96,7 @@ class Values:
         other = copy.copy(self)
         parts = self.chunks, self.parameters, self.t, self.networks.weights
         other.chunks, other.parameters, other.t, weights = still(parts)
+        # Entries and outputs of networks that were remembered are differentiated ones.
         other.networks, other._scalars = Networks(weights), {}
         return other
 
@@ -108,6 +109,7 @@ class Values:
     def _entry(self, name: str, k: int) -> Array:
         """An entry of the parameters or of the typical sizes, a scalar."""
         array = getattr(self, name)
+        # Splitting an array makes all of its entries scalars of the program, so only short ones are split.
         if array.shape[0] > FEW:
             return array[k]
         if name not in self._scalars:
@@ -130,6 +132,8 @@ class Values:
             coefficients: list[Scalar] = [float(c) for c in group.coefficient[0]]
         else:
             parameters = [
+                # A parameter that all instances share stays a scalar. Gathered, it would be copied for each of them,
+                # and reverse mode would scatter into all parameters.
                 self._entry("parameters", int(column[0]))
                 if (column == column[0]).all()
                 else take(self.parameters, column)
@@ -147,6 +151,8 @@ class Values:
     def solved(self, planned: PlannedEquation, unknown: int, local: list[Any]) -> Array:
         """The local unknown for which the equation, affine in it, holds."""
         group = planned.equation
+        # Slots with numeric coefficients are one product of arrays where they are many: written out, each term is an
+        # operation of the program.
         positions = [k for k, u in enumerate(group.local) if u == unknown]
         outside = [k for k in range(len(group.local)) if k != positions[0]]
         is_long = isinstance(group.template, LinearTemplate) and len(outside) >= LONG_SUM
@@ -154,11 +160,14 @@ class Values:
             weights = -group.coefficient[:, outside] / group.coefficient[:, [positions[0]]]
             return scaled_by(1 / planned.factors[positions[0]], self.long_sum(planned, outside, weights), self.dtype)
         local = list(local)
+        # A Python number, which is folded while the program is traced: the residual at zero is what the equation is
+        # solved from.
         local[unknown] = 0.0
         at = self.equation(planned, local)
         if len(positions) == 1:
             value = group.template.solve(positions[0], *at.arguments)
             return scaled_by(1 / planned.factors[positions[0]], value, self.dtype)
+        # The unknown stands in several slots: the template cannot be solved for one of them.
         return -at.residual() / at.slope(unknown, at.partials())
 
     def long_sum(self, planned: PlannedEquation, positions: Sequence[int], weights: np.ndarray) -> Array:

@@ -51,6 +51,7 @@ def appended(table: PyTree, noted: PyTree, y0: State, y1: State) -> PyTree:
         return None
 
     def one(table: PyTree, rows: PyTree) -> PyTree:
+        # Rows that are not appended have a place past the end of the table, so that no branch is needed.
         return table.at[_places(table, rows, y0, y1)].set(rows, mode="drop") if table.shape[0] else table
 
     return jax.tree.map(one, table, noted)

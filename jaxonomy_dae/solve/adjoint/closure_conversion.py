@@ -82,6 +82,8 @@ def closure_convert(function: Any, *args: Args) -> tuple[ClosureConverted, list[
     closed = jax.make_jaxpr(flat)(*leaves)
     out_structure, (others, others_structure) = found
     shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.out_avals)
+    # A trace is kept as a program rather than the Python function: a derivative calls the function several times, and
+    # would trace the user's code anew each time.
     evaluate = private("eval_jaxpr")
     program, constants = parts_of_constants(closed.jaxpr, list(closed.consts))
 
@@ -116,6 +118,8 @@ def by_itself_or_batched(
     @alone.def_vmap
     def _(axis_size, in_batched, consts, *leaves):
         del axis_size
+        # Where one argument of a batch is batched, so is the whole result: which outputs stay alike would have to be
+        # traced to be known.
         axes = jax.tree.map(lambda batched: 0 if batched else None, (in_batched[0][1], *in_batched[1:]))
         out = jax.vmap(many.call, in_axes=axes)(consts[1], *leaves)
         return out, jax.tree.map(lambda _: True, out)

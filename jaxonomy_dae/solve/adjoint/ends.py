@@ -89,6 +89,7 @@ class Ending(diffrax.AbstractAdaptiveStepSizeController):
         return Ending(self.controller.wrap(direction), tuple(end.wrap(direction) for end in self.ends))  # pyright: ignore[reportCallIssue]
 
     def _inside(self, terms, y):
+        # From the outermost end inwards: each sees what the ones around it have left of the state.
         for end in reversed(self.ends):
             terms, y = end.inside(terms, y)
         return terms, y
@@ -111,6 +112,8 @@ class Ending(diffrax.AbstractAdaptiveStepSizeController):
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
         """Accepts or rejects the step and proposes the next one; see `diffrax.AbstractStepSizeController`."""
+        # The controller by errors goes first: it alone knows the error, and ends only shorten or reject what it
+        # proposes.
         before, states = controller_state
         x0, x1 = self._inside(None, y0)[1], self._inside(None, y1)[1]
         keep, start, last, jump, after, result = self.controller.adapt_step_size(
@@ -129,6 +132,7 @@ class Ending(diffrax.AbstractAdaptiveStepSizeController):
 
 def ending(controller: Controller, *ends: End) -> Controller:
     """The controller with more ends, after those that it has. One that clips steps stays outermost."""
+    # It tells by the start of the next step whether a jump lies behind, so it must see which steps the ends reject.
     if isinstance(controller, diffrax.ClipStepSizeController):
         return eqx.tree_at(lambda c: c.controller, controller, ending(controller.controller, *ends))
     if isinstance(controller, Ending):

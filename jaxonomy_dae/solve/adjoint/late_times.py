@@ -63,6 +63,7 @@ def diffeqsolve(of: Integration, solver_state: bool, progress: diffrax.AbstractP
     """`diffrax.diffeqsolve` without its checks of times, for an interval and times of one dtype. What is saved is found
     in `ts["out"]` and `ys["out"]`, the last accepted point in `ts["last"]` and `ys["last"]`."""
     subs, controller, adjoint = {"last": diffrax.SubSaveAt(t1=True)}, of.controller, of.adjoint
+    # With another version of Diffrax the times are given to it, and its checks return with them.
     if of.save.ts is None or missing(FOR_LATE_TIMES) is not None:
         subs["out"] = of.save
     else:
@@ -91,6 +92,8 @@ class _LateTimes(diffrax.AbstractAdjoint):
 
     def loop(self, **given: PyTree) -> PyTree:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The loop over the steps, as `diffrax.diffeqsolve` calls it; buffers and times of `SaveAt` are put in here."""
+        # Diffrax's loop goes forwards in a time of its own: times are turned for it, and turned back for the user's
+        # function.
         state, saveat, t0 = given["init_state"], given["saveat"], given["t0"]
         ts, direction = self.save.ts, self.direction
         assert ts is not None
@@ -139,6 +142,7 @@ class _StepTo(diffrax.AbstractStepSizeController):
         return _StepTo(turned)  # pyright: ignore[reportCallIssue]
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        # What `diffrax.StepTo.init` returns: the end of the first step, and the place of the time after it.
         return self.controller.ts[1], 2
 
     def adapt_step_size(self, *given):  # pyright: ignore[reportIncompatibleMethodOverride]

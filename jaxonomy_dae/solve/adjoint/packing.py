@@ -36,6 +36,7 @@ class Packing:
         """Packs the leaves of a tree into the vectors."""
         leaves = jax.tree.leaves(tree)
         return [
+            # A leaf by itself keeps its shape: ravelling and reshaping it would be two operations for nothing.
             leaves[inside[0]] if len(inside) == 1 else jnp.concatenate([jnp.ravel(leaves[i]) for i in inside])
             for inside in self.members
         ]

@@ -59,6 +59,8 @@ def parts_of_constants(jaxpr: Any, consts: list[Array]) -> tuple[Any, list[Array
             if parts and same == large:
                 equation = _call(equation, program, parts)
         kept.append(equation)
+    # An equation that led to a part only is not needed any more, and would keep its constant in every step's
+    # cotangents.
     kept = _live(kept, jaxpr.outvars)
     used = _variables([*(v for e in kept for v in e.invars), *jaxpr.outvars])
     both = {v: c for v, c in (value | found).items() if v in used}
@@ -69,6 +71,8 @@ def _split(jaxpr: Any, constants: Collection[Any]) -> Split:
     constant, before, parts = set(constants), [], {}
     for equation in jaxpr.eqns:
         read = [v for v in equation.invars if _is_variable(v)]
+        # What follows from constants alone is constant, too: a part of a reshaped array is read before the loop as
+        # well.
         if equation.effects or not constant.issuperset(read):
             continue
         constant.update(equation.outvars)

@@ -30,6 +30,7 @@ def solve(numbers: dict[str, PyTree], program: SolveProgram) -> tuple[PyTree, Py
     def advance(carry):
         state, buffers, table = carry
         active = going(state, numbers, program)
+        # This loop is the whole solve where nothing is differentiated: it records nothing, and holds no step back.
         new, buffers, noted, _ = program.body(numbers["body"], state, buffers, active, jnp.array(True))
         # A step that is rejected appends nothing: it leaves the state as it was.
         return unless_waiting(active, new, state), buffers, appended(table, noted, state.y, new.y)
@@ -65,6 +66,7 @@ class _Recorder:
 
     def _taken_apart(self, state, last, moves, pushed):
         names = ("y", "solver_state", "tprev", "tnext") + (("made_jump",) if self.program.jumps else ())
+        # A row holds what a step depends on and nothing else: the larger it is, the fewer rows a record has.
         row = {name: getattr(state, name) for name in names} | dict(last=last, moves=moves[:2])
         return row, (dataclasses.replace(state, **dict.fromkeys(names)), moves[2:], pushed)
 
@@ -146,11 +148,14 @@ def _(perturbed, numbers, program):
     loop = lax.while_loop(lambda loop: recorder.going(loop[0]), advance, loop)
     carry, buffers, table, chunks, stride, kept, record, filled = loop
     state, _, moves, _ = recorder.unpack(carry)
+    # Outside of jit the pullback is compiled when the values are known. Told by this flag that nothing has to be run
+    # again, it leaves half of the program out (`host/whole_records.py`).
     return (state, buffers, table), (state, moves, chunks, stride, kept, record, filled, flag(chunks <= 1))
 
 
 @solve.def_bwd
 def _(residuals, cotangents, perturbed, numbers, program):
+    # JAX calls this rule outside of the context in which the solve was called.
     with jax.default_matmul_precision(program.precision):
         return _backwards(residuals, cotangents, perturbed, numbers, program)
 

@@ -77,6 +77,8 @@ class Resting(eqx.Module):
         is_array = isinstance(x, jax.Array) and x.ndim == 1 and x.size > 0
         is_adaptive = isinstance(_inner(solver), diffrax.AbstractAdaptiveSolver) and rtol is not None
         prescribed = isinstance(base, diffrax.StepTo | diffrax.ConstantStepSize)
+        # Steps that the user prescribes are not to be changed, and without an error estimate a second run would limit
+        # nothing.
         if prescribed or not is_array or not is_adaptive:
             return None
         return Resting(terms, _small(solver, base), base, args, span)
@@ -108,6 +110,7 @@ class Resting(eqx.Module):
         rests = resting._rests(slope, x)
         rate = jnp.max(jnp.abs(pushed - slope) / scale) / PUSH
         resolved = jnp.minimum(end, t + RESOLVED / jnp.where(rate > 0, rate, 1.0))
+        # A push out of where the field is defined says nothing of rates; then the shortest step is taken.
         first = jnp.where(jnp.isfinite(rate), jnp.where(rate > 0, resolved, end), t)
         return jnp.where(jnp.any(rests), jnp.maximum(first, _shortened(t, end)), end)
 
@@ -116,9 +119,12 @@ class Resting(eqx.Module):
         component has come to rest. `step.y1` is `step.y0` if the step was rejected."""
         resting, step, pushed = still((self, step, pushed))
         x0, x1, h = _moving(step.y0), _moving(step.y1), step.t1 - step.t0
+        # The mean slope of the step is at hand: to evaluate the field would be one more copy of it in the program.
         rests = resting._rests((x1 - x0) / jnp.where(h > 0, h, 1.0), x1)
         rests = jnp.where(step.accepted, rests, pushed.resting)
         look = jnp.any(rests) & (step.accepted | pushed.exists) & ~pushed.given_up & (step.end > step.start)
+        # After a step that was rejected the second run stands where the first one still is. After an accepted one it
+        # has to be taken along, or begun anew.
         without = eqx.tree_at(lambda p: p.exists, pushed, pushed.exists & ~step.accepted)
         return lax.cond(
             any_member(look),
@@ -158,6 +164,7 @@ class Resting(eqx.Module):
             settles = fresh & (tries < SETTLING)
             planned, end = end, jnp.where(settles, _shortened(start, end), end)
             y1, error, _, state1, result = solver.step(terms, start, end, y, self.args, state, fresh)
+            # A controller without memory: that of the first run belongs to other errors.
             _, controlled = self.controller.init(terms, start, end, y, end - start, self.args, None, order)
             keep, _, following, *_ = self.controller.adapt_step_size(
                 start, end, y, y1, self.args, error, order, controlled

@@ -33,7 +33,8 @@ class ReverseStep:
             "save_ts": [taken(f, c) for f, c in zip(perturbed["save_ts"], numbers["save_ts"], strict=True)],
         }
         self.ts_wanted = perturbed["ts"]
-        # The parts of `SaveAt` whose saved rows have a cotangent.
+        # The parts of `SaveAt` whose saved rows have a cotangent: functions that save what nobody reads are left out of
+        # the program.
         live = [i for i, saved in enumerate(self.saved) if jax.tree.leaves(saved)]
         self.save_steps = [i for i in live if program.every[i]]
         self.save_ts = [i for i in live if program.save_ts[i] is not None]
@@ -109,6 +110,7 @@ class ReverseStep:
 
     def _saved_step(self, carry, i, kept, y1):
         """Pulls back the cotangents of the values saved at the end of the step."""
+        # Which steps were saved follows from their count, so that no row has to record it.
         here = kept & (carry["accepted"] % self.program.every[i] == 0)
         at = carry["row"][i] - 1
         t, move = carry["after"]
@@ -147,6 +149,7 @@ class ReverseStep:
             _, pull = jax.vjp(saved, t, (row["tprev"], row["tnext"]), dense, consts)
             by_t, *by = pull(ct)
             new = jax.tree.map(jnp.add, (dense_ct, ends_ct, consts_ct), (by[1], by[0], by[2]))
+            # The time is saved beside the value: its own cotangent adds to that of the value by the time.
             if ts_ct is not None:
                 new_ts = ts_ct.at[index - 1].add(unless_waiting(here, by_t + t_ct, jnp.zeros_like(by_t)))
             else:
@@ -155,6 +158,7 @@ class ReverseStep:
             index, at, *new = unless_waiting(here, (index - 1, at - 1, *new), old)
             return index, at, *new, new_ts
 
+        # From the last saved time of the step to the first: the index into the times goes down with the rows.
         start = (carry["index"][i], carry["row"][i], dense_ct, ends_ct, carry["save_ts"][i], carry["ts"][i])
         loop = lax.while_loop(lambda loop: any_member(inside(loop[0])), one, start)
         index, at, dense_ct, ends_ct, consts_ct, ts_ct = loop

@@ -63,6 +63,7 @@ class StepTimes:
             return ()
         program, numbers = self.program, self.numbers
         y1, error = taken
+        # As Diffrax does: an error that is not a number rejects the step.
         error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
         fixed = eqx.filter(state.controller_state[0], eqx.is_inexact_array, inverse=True)
         floor = clip_floor(numbers["t1"])

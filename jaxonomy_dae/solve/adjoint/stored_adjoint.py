@@ -78,15 +78,17 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             return self._by_checkpoints(**given)
         terms, solver, saveat, max_steps = (given[name] for name in ("terms", "solver", "saveat", "max_steps"))
         init_state, progress_meter = given["init_state"], given["progress_meter"]
+        # The table that steps append to counts neither in the size of a row nor in what is kept.
         y, empty = apart(init_state.y)
         init_state = dataclasses.replace(init_state, y=y)
         size = sum(
             leaf.size * leaf.dtype.itemsize
             for leaf in jax.tree.leaves(_arrays((init_state.y, init_state.solver_state)))
         )
+        # A gradient outside of jit knows how large its batch is; inside, the tracers of `vmap` say it.
         members = max(self.members, batch_size((terms, given["args"], y, init_state.tprev)))
-        # Beside what events cost, a run by itself does not gain by stages that are written out: the gradient of a
-        # bouncing ball takes 0.26 ms for 0.27, and a fifth longer to be traced.
+        # Events cost more than stages, so a run by itself that has events does not gain by stages that are written out:
+        # with them the gradient of a bouncing ball takes 0.26 ms in place of 0.27, and a fifth longer to be traced.
         if members == 1 and isinstance(y, AbstractAppending):
             given["solver"] = solver = _in_a_loop(solver) or solver
         chunk, points = _table(max_steps, size, members)
@@ -112,6 +114,8 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             init_state,
             made_jump=jnp.asarray(init_state.made_jump) if functions["jumps"] else False,
             result=as_traced(init_state.result),
+            # Diffrax's loop hands controllers and meters their states and nothing else, so that flags for them travel
+            # in these.
             controller_state=(init_state.controller_state, jnp.array(True)),
             progress_meter_state=(init_state.progress_meter_state, jnp.array(True)),
         )
@@ -168,12 +172,15 @@ def _table(max_steps: int | None, size: int, members: int) -> tuple[int, int]:
     least = ROWS if members == 1 else ROWS_IN_BATCH
     chunk = min(max(ROOMY_RECORD // max(size * members, 1), least), 256)
     if max_steps is not None and members == 1:
+        # With half as many points as rows, `max_steps` are at most eight times their product.
         chunk = max(chunk, math.isqrt(max_steps // 4))
+    # An even number of points, since every other one is given up when all are in use.
     return chunk, chunk // 2 // 2 * 2
 
 
 def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
     """The loop that saves at times within a step, not differentiated by itself."""
+    # Its derivative is written by hand (`reverse_step`). A loop that Diffrax would differentiate keeps checkpoints.
     del checkpoints
     return private("while_loop")(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
 
@@ -198,6 +205,7 @@ def _outer_loop(
             saved = tuple((save.ts, save.ys) for save in state_saves(out))
             return _without_buffers(out), saved, stepper.noted, stepper.taken
 
+        # Buffers of saved values stay out of the state: they would be part of every row and of every point kept.
         start = _without_buffers(start)
         flag = jnp.array(True)
         converted, consts = closure_convert(body, start, buffers, flag, flag)
@@ -218,6 +226,7 @@ def _functions(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns (the functions of `SolveProgram` except its body, the arrays they close over)."""
     s = init_state
+    # The controller's own times may be differentiated, so they are arguments and not closed over.
     controller, others = eqx.partition(stepsize_controller, eqx.is_inexact_array)
     order = solver.error_order(terms)
 
@@ -306,6 +315,8 @@ class _Solver:
     """The part of a solver's interface that Diffrax's loop calls. `noted` are the rows that the last step appends to
     the table of the state, `taken` its end and error."""
 
+    # Diffrax's loop returns its own state and no more: what a step appends, and its error, leave the trace by
+    # attributes.
     noted: PyTree = None
     taken: PyTree = None
 

@@ -78,10 +78,12 @@ def aftermath(
     """
     c, g = problem.facts.n_clocks, problem.facts.n_guards
     left = instant.left & ~now.these
+    # Without conditions, only clocks are left: nothing falls, and the slope alone is new.
     if not g:
         slope = problem.slope(t, x, q, args)
         unchanged = instant.caused, instant.stuck, instant.later
         return Aftermath(q, slope, jnp.ones_like(x), instant.state.armed, left, *unchanged)
+    # What the event wrote keeps its derivatives; everything that is decided below is decided on numbers.
     written_q = q
     problem, t, time, x, q, delay, args = still(constant_once((problem, t, time, x, q, now.delay, args)))
     instant, now = still(instant), now._replace(delay=delay)
@@ -118,6 +120,8 @@ def _outlook(
     def look(carry):
         k, search, slopes, values, rates = carry
         slope, now = slopes[0], jnp.where(search.flipped(sets), 1.0 - q, q) if problem.facts.choices else q
+        # The place before the event shows how far its guards were from zero: one that waits for its turn still counts
+        # as at zero there. The one before the delay shows which slopes change while the state is followed back.
         places = jnp.stack([x, instant.arrived, x - slope * delay, x + slope * ahead])
         time = jnp.stack([own_time, t, t, t + ahead])[k]
         own = problem.slope(time, places[k], now, args)
@@ -128,6 +132,7 @@ def _outlook(
             return k + 1, search, *carry
         violated = (value < 0) & ~is_zero(value, rate, arrival)
         after, found = search.after(sets, own, value, violated[conditions])
+        # Modes are searched for at the first place only. The others are looked at with what was found.
         after = jax.tree.map(lambda new, old: jnp.where(k == 0, new, old), after, search)
         return k + (found | (k > 0)).astype(k.dtype), after, *carry
 
@@ -178,7 +183,8 @@ def _sides(
     true = jnp.where(zero, falls | stays, value < 0)
     was_armed = ((armed > 0) & ~here) | (turns_back & (event >= c)) | (now.rose & ~here) | repeated
     # What this event made true happens next. A pending event still happens, even if a state was set anew: unless the
-    # new values make its condition false, or it is revocable and undone.
+    # new values make its condition false, or it is revocable and undone. Otherwise, of two balls that reach the floor
+    # at one instant, the bounce of the first would cancel that of the other.
     stands = left[c:] & ~problem.facts.are(EventFlag.REVOCABLE)[c:] & reached
     caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & (~zero | equal | landed)
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands

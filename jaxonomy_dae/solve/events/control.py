@@ -22,6 +22,8 @@ class AtEvents(End):
     was none."""
 
     def inside(self, terms, y):
+        # The controller by errors sees the continuous state alone. Counts and times of the bookkeeping have no error,
+        # and would dilute a norm.
         return None if terms is None else bound(terms, y.q), y.x
 
     def first(self, t, end, y, args, span):

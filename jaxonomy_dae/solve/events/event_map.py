@@ -59,6 +59,7 @@ def handle(
     """
     args, may_jump = problem.at_instant(args)
     first = arrival.due
+    # At the initial time there is no before against which something could have jumped.
     if may_jump and problem.facts.n_guards and not at_start:
         arrival, first = _with_jumps(problem, t, state, arrival, args)
     events = _Events.of(problem, t, state, arrival, args, at_start)
@@ -94,6 +95,7 @@ def _with_jumps(
     due = arrival.due | jnp.concatenate([of_clocks, falls])
     turned = jnp.concatenate([of_clocks, falls]) & problem.facts.are(EventFlag.RELATION)
     first = jnp.where(jnp.any(turned), turned, due)
+    # What jumps does so at a time that the input or the clock gives: the crossing has no δ of its own.
     return arrival._replace(due=due, jumped=arrival.jumped | falls, size=size), first
 
 
@@ -149,21 +151,27 @@ class _Events(NamedTuple):
             begun = begun & candidates & ~self.last  # they read what all others have left
         goes_on = jnp.any(begun)
         together = candidates & (instant.round | ~goes_on)
+        # All events of a round read what was before the first of them. Otherwise the order of declaration would decide
+        # what they see.
         base, base_slope, previous = (
             jnp.where(goes_on, kept, now)
             for kept, now in ((instant.before, state.x), (instant.approach, instant.slope), (instant.previous, q))
         )
+        # Beyond all numbers where nothing is left: `one_hot` of that is empty, and nothing is written.
         now = self._happening(instant, jnp.where(jnp.any(together), jnp.argmax(together), c + g))
         event, delay = now.event, now.delay
         # What another event caused happens at the time of that one, where the state is what it left. The slope between
         # them may be as large as you please, as that of parts that are held to see what force it takes.
         caused = ~now.is_clock & instant.caused[jnp.clip(event - c, 0, max(g - 1, 0))] if g else jnp.array(False)
+        # Events that follow one another at one instant have a δ each: parameters part their times, and with one δ for
+        # all the Jacobian is wrong.
         time, reached = t + delay, jnp.where(caused, instant.there, state.x + instant.slope * delay)
         if c:  # a step may end a rounding error off the tick, at whose time equations read
             time = jnp.where(now.is_clock, now.tick, jnp.where(caused, instant.time, time))
         x, written = problem.written(time, reached, base + base_slope * delay, q, previous, now.these, args)
         now = now._replace(moved=jnp.any(x != reached) & ~self.relations[event])
         after = aftermath(problem, t, time, x, written, instant, arrival, now, args)
+        # Ticks are counted, and times follow from the count: a sum of periods would drift by a rounding at each tick.
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         turns = state.turns + (~now.is_clock).astype(t.dtype)
         again = self._again(now, after.stuck, turns)
@@ -226,6 +234,7 @@ class _Events(NamedTuple):
             delay = jnp.where(is_clock, delay, crossing)
         if c and not self.at_start:
             tick = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
+            # Zero, with the derivative of the tick's time by parameters.
             delay = jnp.where(is_clock, tick - lax.stop_gradient(tick), delay)
         # Parts that strike at the same instant do so at once, whatever the order: a box that falls flat does not turn.
         # All share the δ of the first: if a parameter parts their instants, the derivative is one-sided, as at any
@@ -265,6 +274,8 @@ def _crossing(events: _Events, instant: Instant, event: Array) -> tuple[Time, Ar
     problem, t, arrival, args, relations = events.problem, events.t, events.arrival, events.args, events.relations
     c, g, state = problem.facts.n_clocks, problem.facts.n_guards, instant.state
     k = jnp.clip(event - c, 0, max(g - 1, 0))
+    # The derivative of δ is that of −g/ġ with ġ constant, so the guards are evaluated once with and once without
+    # derivatives.
     values = problem.guards(t, state.x, state.q, args)
     value, rates = problem.rates(t, state.x, state.q, args, instant.slope)
     # A guard that has just risen to zero would be above it but for this event: it falls if the event turns it back. A
@@ -272,6 +283,8 @@ def _crossing(events: _Events, instant: Instant, event: Array) -> tuple[Time, Ar
     rose = (state.armed == BELOW) & is_zero(value, rates, arrival) & (rates > 0) & ~relations[c:]
     # A condition whose guard has jumped onto zero and does not move there is true unless it is strict.
     onto = arrival.jumped & (value == 0) & (rates == 0) & ~problem.facts.are(EventFlag.STRICT)[c:]
+    # A guard without a rate has jumped or rests, and its δ counts nowhere. A division by zero would still make its
+    # derivative not-a-number.
     crossing = -values[k] / jnp.where(rates[k] == 0, 1.0, rates[k])
     # Where another event has made the guard slow, rounding is all that is left of its value.
     frozen = lax.stop_gradient(crossing)
@@ -285,6 +298,8 @@ def _while_any_is_left(step: Callable[[Instant], Instant], times: int) -> Callab
     """The step repeated so many times; it is skipped where no event is left."""
 
     def once(instant: Instant, _: None) -> tuple[Instant, None]:
+        # Under vmap a condition that differs by member makes `cond` a select, which computes both branches in every
+        # turn. So the branch is taken where any member goes on, and the others keep what they have.
         going = jnp.any(instant.left)
 
         def go(instant: Instant) -> Instant:

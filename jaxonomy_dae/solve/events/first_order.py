@@ -37,6 +37,8 @@ def differentiable_once(value):
 @differentiable_once.defjvp
 def _(primals, tangents):
     (value,), (tangent,) = primals, tangents
+    # A tangent does not depend on the value, so that a second derivative would be zero without a word. The factor,
+    # which is one, refuses it.
     return differentiable_once(value), tangent * _one(value)
 
 
@@ -64,5 +66,7 @@ def _refused_one(primals, tangents):
     return _refused((jnp.ones_like(primals[0]),), tangents)
 
 
+# With zeros as arrays, as JAX hands them over by default, forward mode over reverse mode would be refused even where
+# nothing of the event moves.
 _not_again.defjvp(_refused, symbolic_zeros=True)
 _one.defjvp(_refused_one, symbolic_zeros=True)

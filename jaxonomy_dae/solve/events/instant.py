@@ -101,6 +101,8 @@ class Happening(NamedTuple):
 
 def within(rate: Array, arrival: Arrival) -> Array:
     """How far from zero a guard with this rate may be that reaches zero, or has left it, within the window."""
+    # The step that ends at a crossing was located in another step, with other errors: it ends off the crossing by a
+    # time, which the rate turns into a distance.
     return jnp.minimum(jnp.abs(rate) * arrival.window, CLOSE * arrival.size)
 
 

@@ -37,6 +37,7 @@ class EventRows(eqx.Module):
         log, sides = self.log, self.sides
         if log.shape[0]:
             each = [jnp.broadcast_to(time, rate.shape), events.astype(time.dtype), lax.stop_gradient(rate)]
+            # Events beyond the room are counted, so that a run can say how many there were, and not listed.
             log = log.at[row].set(jnp.stack(each, axis=1), mode="drop")
         if sides.shape[0]:
             sides = sides.at[row].set(jnp.stack([before, after])[None], mode="drop")

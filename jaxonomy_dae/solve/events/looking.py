@@ -49,6 +49,7 @@ _RATE_AT_END = np.append(_DIVIDED, -_DIVIDED.sum())
 
 def _between(place: Array, values: Array) -> Array:
     """Evaluates the polynomial through `values` at LOOKS, shape (looks, guards), at `place`, a fraction of the step."""
+    # The search stays strictly between two looks, so nothing is divided by zero.
     weights = jnp.asarray(_WEIGHTS, values.dtype) / (place - jnp.asarray(LOOKS, values.dtype))
     return weights @ values / jnp.sum(weights)
 
@@ -95,6 +96,8 @@ def looked_at(
     At kinks the state is continuous, so the crossing is taken from the polynomial through the guards' values, and so is
     their rate at the end. At jumps the crossing is solved for with the equations, which give the rate, too.
     """
+    # Decisions are made on numbers alone, and the map of the event carries all derivatives. So reverse mode goes back
+    # over no search, which was half of the time of a gradient.
     step = still(_Step(problem, dense, t0, t1, y0, x1, args))
     problem, dense, t0, t1, y0, x1, args = step
     h, q, g = t1 - t0, y0.q, problem.facts.n_guards
@@ -108,9 +111,11 @@ def looked_at(
     if not g:
         before = zero
         if not problem.facts.only_kinks:
+            # The field is evaluated once more for a tick alone, of which most steps have none.
             before = lax.cond(any_member(jnp.any(ticking)), lambda: problem.slope(t1, x1, q, args), lambda: zero)
         return Met(never, y0.armed, y0.size, Arrival(before, y0.size, ticking, none, y0.size, window, span))
 
+    # The last place is the end itself: t0 + h may be rounded off it, and off a tick or a saved time.
     times = jnp.append(t0 + h * jnp.asarray(LOOKS[:-1], t1.dtype), t1)
     states = jnp.concatenate([jax.vmap(lambda t: dense(t0, t1, t))(times[:-1]), x1[None]])
     values = jax.vmap(lambda t, x: problem.guards(t, x, q, args))(times, states)
@@ -120,6 +125,7 @@ def looked_at(
     # Most steps meet nothing: all guards are farther from zero than they were seen to move.
     moves = jnp.max(values, axis=0) - jnp.min(values, axis=0)
     side = jnp.where(values[-1] > 0, ABOVE, BELOW)
+    # Between two looks, guards are taken to move by no more than the looks show and twice what a parabola misses.
     far = jnp.min(size, axis=0) > moves + 2 * off + rounding(largest)
     quiet = jnp.all(far & (side == y0.armed)) & ~jnp.any(ticking)
 
@@ -203,12 +209,15 @@ def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> M
             guards, crossed[place], times[place], times[place + 1], values[place], values[place + 1], inside
         )
 
+    # The search evaluates the equations some ten times, which steps without a crossing need not pay for.
     where = lax.cond(any_member(inside), located, lambda: t1)
     # A retried step must be long enough for time to go on.
     where = jnp.maximum(where, t0 + 2 * problem.resolution)
     dip = jnp.where(long, _dip(values, armed, jnp.any(crossed, axis=0), 2 * off - band), jnp.inf)
     request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)
+    # Halves come before all else: what was located in a guard that is not resolved may not be the first crossing.
     request = jnp.where(bent, t0 + 0.5 * h, request)
+    # Nothing happens at the end of a step that is taken again.
     due = jnp.concatenate([ticking, near]) & ~jnp.isfinite(request)
     arrival = arrival._replace(slope=before, due=due, jumped=jumped)
     side = jnp.where(above[-1], ABOVE, jnp.where(armed[-1], RESTS, BELOW))

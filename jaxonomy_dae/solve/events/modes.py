@@ -56,6 +56,7 @@ class Search(NamedTuple):
     def after(self, sets: Array, slope: Array, guards: Array, violated: Array) -> tuple["Search", Array]:
         """(the search after the slope and the guards of what was tried, whether it has found its values: `base`)."""
         dtype = self.wrong.dtype
+        # Not whether, but how many: each part that becomes regular is progress, though others are still singular.
         lost = jnp.sum(~jnp.isfinite(slope), dtype=dtype) + jnp.sum(~jnp.isfinite(guards), dtype=dtype)
         wrong = SINGULAR * lost + jnp.sum(violated, dtype=dtype)
         first, now = self.tried == 0, self.flipped(sets)

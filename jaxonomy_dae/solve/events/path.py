@@ -25,6 +25,8 @@ ATTEMPTS = 40  # pieces that are tried: each is half or twice as long as the one
 def _weights() -> np.ndarray:
     """For each column, the weights of it and those before it in the value for substeps of no length: an even polynomial
     in the substep, at zero."""
+    # By the squares of the numbers of substeps: errors of the midpoint rule have even powers alone, so that each column
+    # raises the order by two.
     n = np.array(SUBSTEPS, float) ** 2
     out = np.zeros((len(n), len(n)))
     for k in range(len(n)):
@@ -117,6 +119,8 @@ def path_end(
         )
 
     def attempted(path: _Path) -> _Path:
+        # The order is raised until two columns agree. A jump is found to ten digits, for which a method of fixed order
+        # would take many pieces.
         columns = jnp.zeros((len(SUBSTEPS), len(x)), dtype)
         yes = jnp.ones((), bool)
         piece = _Piece(path.x, path.x, columns, path.x, path.guess, ~yes, yes, yes)

@@ -77,6 +77,7 @@ class AbstractHybridProblem(eqx.Module):
         """The time of the next tick of each clock, given the number of ticks so far."""
         period, offset = self.clocks()
         ticks = lax.stop_gradient(ticks)
+        # An event that happens once has an infinite period, and zero times infinity is not a number.
         return offset + jnp.where(ticks == 0, 0.0, ticks * period)
 
     def slope(self, t: Time, x: State, q: Array, args: Args) -> Float[Array, " n"]:
@@ -88,6 +89,8 @@ class AbstractHybridProblem(eqx.Module):
         self, t: Time, x: State, q: Array, args: Args, slope: Array
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
         """Returns (the guards' values, their rates of change along `slope`), both constant under a first derivative."""
+        # A rate is the slope of the guard where the event happens. It divides the guard in δ, whose derivative is exact
+        # with a constant rate.
         frozen, t, x, q, args = constant_once((self, t, x, q, args))
         return jax.jvp(lambda t, x: frozen.guards(t, x, q, args), (t, x), (jnp.ones_like(t), slope))
 

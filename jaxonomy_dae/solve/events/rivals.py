@@ -17,7 +17,7 @@ class Rivals(NamedTuple):
 
     @classmethod
     def of(cls, facts: EventFacts) -> "Rivals":
-        """Those among the events."""
+        """The rivals among the events."""
         places = tuple(dict.fromkeys(place for _, place in facts.contested))
         writers = np.zeros((len(facts.flags) + 1, len(places)), bool)  # the last row is that of no event
         for event, place in facts.contested:

@@ -52,6 +52,7 @@ def first_crossing(
         truncated = jnp.where(truncation <= distance, guess + towards * truncation, middle)
         # What bisection would still have of the bracket, beyond what is left of it.
         radius = jnp.maximum(0.5 * (floor * jnp.exp2(halvings + SLACK - k) - width), 0.0)
+        # The estimate may be anywhere, but not so far from the middle that the bracket would fall behind bisection.
         t = jnp.where(jnp.abs(truncated - middle) <= radius, truncated, middle - towards * radius)
         # Strictly inside the bracket, so that each evaluation makes it shorter.
         t = jnp.clip(t, low + SHORTEST * width, high - SHORTEST * width)

@@ -99,8 +99,11 @@ class WithEvents(WrappedSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         problem = problem_of(terms)
+        # The table of events takes no part in a step, and would be kept with each state for reverse mode.
         y0, table = apart(y0)
         inner_state, jumped = solver_state
+        # Diffrax knows the jumps that its controller reports. That an event ended the last step is known here: methods
+        # with a history, or with a slope kept from the last stage, begin anew after it.
         made_jump = jumped if made_jump is False else made_jump | jumped
         solver = problem.prepared(self.solver, y0.q)
         x1, y_error, info, inner_state, result = solver.step(
@@ -120,6 +123,7 @@ class WithEvents(WrappedSolver):
         def events(state):
             return handle(problem, t1, state, arrival, args, noted)
 
+        # Where all events are kinks, what happens is a few selects. No branch is needed, and no slope.
         if problem.facts.only_kinks:
             then, _ = problem.at_instant(args)
             y1, slope = turned(problem, t1, state, values, arrival.due, then), jnp.zeros_like(x1)
@@ -130,9 +134,11 @@ class WithEvents(WrappedSolver):
         dense_info = dict(
             inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution, **{NOTED: noted}
         )
+        # A step that failed by itself keeps its own result: that x1 is not finite says nothing of the event.
         finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
         result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
+        # Where an event ends the run, it does no harm that events would repeat.
         result = diffrax.RESULTS.where((y1.stuck >= 0) & (y1.ended == 0), STUCK, result)
         result = diffrax.RESULTS.where(y1.stuck < -1, CLASH, result)
         y1 = together(y1, appended(table, noted, y0, y1))

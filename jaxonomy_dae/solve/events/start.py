@@ -86,6 +86,7 @@ def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Array | None
     period, offset = (lax.stop_gradient(v) for v in problem.clocks())
     relations = problem.facts.are(EventFlag.RELATION)[:c]
     passed = t0 - problem.resolution - offset
+    # A tick that falls on t0 up to rounding is still to come: it happens at the start.
     ticks = jnp.where(jnp.isinf(period), (passed > 0).astype(dtype), jnp.ceil(passed / period))
     # Clocks of relations are counted from before t0, too. Other clocks start at tick 0.
     ticks = jnp.where(relations, ticks, jnp.maximum(ticks, 0.0))
@@ -149,4 +150,5 @@ def _settled(
     if g:  # in a loop, for XLA compiles the equations as often as they are written
         rounds = ROUNDS if relations[c:].any() else 0
         found, rate, value = lax.fori_loop(0, rounds + 1, once, (found, rate, value))
+    # A value that has not changed keeps its derivative; one that was decided has none.
     return jnp.where(found == begin, q0, found), rate, value

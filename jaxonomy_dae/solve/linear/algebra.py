@@ -39,6 +39,7 @@ class Dense(eqx.Module):
 
     def jacobian(self, function: Callable[[Array], Array], y: Array) -> tuple[Array, Array]:
         """(F(y), ∂F/∂y, shape (n, n))."""
+        # One evaluation of the function serves the value and all columns.
         value, push = jax.linearize(function, y)
         return value, jax.vmap(push, out_axes=-1)(jnp.eye(y.shape[0], dtype=y.dtype))
 
@@ -102,6 +103,8 @@ class Dense(eqx.Module):
     def solve(self, factor: Factor, matrix: Array | None, b: Array) -> Array:
         """W⁻¹ b, differentiable."""
         factor = jax.lax.stop_gradient(factor)
+        # Derivatives are those of the linear equation, whatever factors solve it: stale factors, or an inverse, do not
+        # show in them.
         return jax.lax.custom_linear_solve(
             lambda x: matrix @ x,
             b,
@@ -127,6 +130,8 @@ class Sparse(eqx.Module):
     def combine(self, mass: Mass, a: Array, jacobian: Array) -> Array:
         """a·M − ∂F/∂y."""
         m = jnp.asarray(_diagonal(mass), jacobian.dtype)
+        # The diagonal has entries of its own beside those of the pattern, which may lack it. Both are added up when
+        # they are solved with.
         return jnp.concatenate([-jacobian, a * m])
 
     def index_matrix(self, mass: Mass, jacobian: Array) -> Array:

@@ -49,6 +49,7 @@ def loop(going: Callable[[_S], Verdict], body: Callable[[_S], _S], state: _S) ->
         while going(state):
             state = body(state)
         return state
+    # Flags and counts travel as numbers of this dtype, which are exact up to 2²⁴ in single precision.
     dtype = jnp.result_type(*(leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)))
     places: dict[tuple[int, ...], list[int]] = {}
     for k, leaf in enumerate(leaves):

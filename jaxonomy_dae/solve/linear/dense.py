@@ -82,6 +82,7 @@ def over(size: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def _power_of_two(size: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    # Dropping all bits of the fraction takes one instruction; a logarithm would round.
     return lax.reduce_precision(size, exponent_bits=jnp.finfo(size.dtype).nexp, mantissa_bits=0)
 
 
@@ -99,6 +100,8 @@ def least_squares(matrix: Float[Array, "m n"], right: Float[Array, " m"]) -> Flo
     largest = jnp.max(jnp.abs(matrix), axis=1, initial=0.0)
     empty = largest < float(jnp.finfo(matrix.dtype).tiny)
     scale = jnp.where(empty, 0, 1 / jnp.where(empty, 1, largest))
+    # QR of the matrix above a small diagonal rather than a pseudo-inverse: there is no threshold that a singular value
+    # may lie beside.
     held = jnp.asarray(ridge(matrix.dtype) * np.eye(n), matrix.dtype)
     stacked = jnp.concatenate([scale[:, None] * matrix, held])
     q, r = jnp.linalg.qr(jax.lax.stop_gradient(stacked))

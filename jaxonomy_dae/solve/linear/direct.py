@@ -89,6 +89,7 @@ class WrittenOut(_AbstractDirect):
     def _solved(self, state, b):
         matrix = state.arrays.T if state.transposed else state.arrays
         scale = jnp.max(jnp.abs(matrix), axis=1)
+        # Pivots are compared across rows, which may have different units.
         matrix, b = matrix / scale[:, None], b / scale
         n = b.shape[0]
         return jnp.stack(solve_written_out([[matrix[i, j] for j in range(n)] for i in range(n)], list(b)))

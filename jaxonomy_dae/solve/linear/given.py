@@ -64,6 +64,7 @@ class ByLineax(eqx.Module):
 
     def _applied(self, factor: Factor, b: Array, transposed: bool) -> Array:
         matrix, arrays = factor
+        # The state of a Lineax solver has static parts, which a loop cannot carry. They are made again from shapes.
         shapes = eqx.filter_eval_shape(lambda m: self.solver.init(self.operator(m), {}), matrix)
         static = eqx.filter(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct), inverse=True)
         state, options = eqx.combine(arrays, static), {}

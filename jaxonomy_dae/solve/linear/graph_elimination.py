@@ -51,6 +51,8 @@ class GraphElimination:
         self._rounds, core = _rounds(with_small_indices(sp.csr_array(matrix)))
         self._core = None
         if core.shape[0]:
+            # The matrix is symmetric positive definite: pivots on the diagonal are stable, and keep the pattern that
+            # the order of minimum degree was chosen for.
             options = {"SymmetricMode": True}
             self._core = scipy.sparse.linalg.splu(
                 core.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options

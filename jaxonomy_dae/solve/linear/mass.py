@@ -28,6 +28,7 @@ class Mass:
                 "the mass matrix of a DAETerm is constant: it cannot be traced. Move what varies into F, or solve for "
                 "other variables"
             ) from None
+        # A matrix that is diagonal is kept as such: products are cheaper, and sparse steps need it.
         if array.ndim == 2 and array.shape[0] == array.shape[1] and not (array - np.diag(np.diag(array))).any():
             array = np.diag(array).copy()
         square = array.ndim == 1 or (array.ndim == 2 and array.shape[0] == array.shape[1])
@@ -36,6 +37,7 @@ class Mass:
                 f"mass must be a finite square matrix (n, n), or its diagonal (n,); got shape {array.shape}"
                 + ("" if np.isfinite(array).all() else " with entries that are not finite")
             )
+        # The digest and what is cached below follow from the entries.
         array.setflags(write=False)
         self.array = array
         self._digest = hashlib.sha256(array.tobytes() + repr(array.shape).encode()).hexdigest()
@@ -68,6 +70,7 @@ class Mass:
         if self.is_diagonal:
             return (self.array == 0).astype(float)
         u, s, _ = np.linalg.svd(self.array)
+        # By singular values rather than by rows of zeros: an algebraic equation may be a combination of rows.
         null = u[:, s <= s.max(initial=0.0) / ILL_CONDITIONED]
         return null @ null.T
 

@@ -79,9 +79,12 @@ def newton(
         tried = look(trial, part, memory)
         accepted = tried.falls | tried.holds | (count == 0)
         x, step, memory = chosen(accepted, (trial, tried.step, tried.memory), (x, step, memory))
+        # The part is doubled, not set to one, after a step that helped: where steps had to be short, the next whole one
+        # would be rejected as many times again.
         part = where(accepted, xp.minimum(2 * part, 1), part / 2)
         if shortest:  # a step that is not finite has no part that helps
             part = where(_finite(step, part), part, 0 * part)
+        # Members of a batch whose equations hold stay where they are while others go on.
         trial = jax.tree.map(lambda a, d: where(tried.holds, a, a + part * d), x, step)
         return trial, x, step, part, tried.holds, memory, count + 1
 

@@ -94,6 +94,7 @@ class SparsePattern:
 
     def merged(self, values: Float[Array, " nnz"]) -> tuple["SparsePattern", Float[Array, " places"]]:
         """The pattern with every place once, and the values there; values at the same place add up."""
+        # Mostly every place occurs once, in order, and the values go to KLU as they are.
         if self.coalesced is None:
             return self, values
         pattern, inverse = self.coalesced
@@ -107,6 +108,7 @@ class SparsePattern:
         dense), every column has its own.
         """
         lengths = np.bincount(self.rows, minlength=self.n_rows).astype(np.int64)
+        # A row with half of the columns needs as many colours, so that little is left to gain.
         if int((lengths**2).sum()) > COLORING_WORK or lengths.max(initial=0) * 2 > self.n:
             return np.arange(self.n)
         by_column: Any = sp.coo_array((np.ones(len(self), np.int8), (self.rows, self.cols)), shape=self.shape).tocsc()
@@ -277,6 +279,8 @@ def _regularised(pattern: SparsePattern, values: Float[Array, " nnz"], nudged: b
     """
     shift = np.random.default_rng(0).uniform(-1, 1, len(pattern))
     if nudged:
+        # One factor for all entries would leave a singular matrix singular, so each entry has its own. They are the
+        # same in every solve, so that a call has one result.
         values = values * (1 + jnp.asarray(ULPS * np.finfo(np.float64).eps * shift))
     return jnp.where(values == 0, jnp.asarray(ZERO * (2 + shift)), values)
 
@@ -284,6 +288,8 @@ def _regularised(pattern: SparsePattern, values: Float[Array, " nnz"], nudged: b
 def _factorized(pattern: SparsePattern, values: Any, b: Any, transpose: bool, nudged: bool) -> Any:
     rows, cols = (pattern.cols, pattern.rows) if transpose else (pattern.rows, pattern.cols)
     double = values.astype(jnp.float64), b.astype(jnp.float64)
+    # The platform is that of the program, which may not be the default one: a function can be compiled for a CPU on a
+    # machine with a GPU.
     x = jax.lax.platform_dependent(
         *double,
         cpu=lambda values, b: klu().solve(

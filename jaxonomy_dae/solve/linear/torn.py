@@ -63,6 +63,7 @@ def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[jax.Array]) ->
     """
     arrays = {at: a for at, a in matrix.items() if isinstance(a, jax.Array)}
     numbers = {at: a for at, a in matrix.items() if at not in arrays}
+    # An entry of NumPy that differs by instance cannot be part of a key.
     if not all(isinstance(a, int | float) for a in numbers.values()):
         return _solver(tearing, numbers)(arrays, list(right))
     return _traced_once(tearing, tuple(sorted(numbers.items())), platform())(arrays, list(right))
@@ -89,6 +90,7 @@ def _solver(tearing: Tearing, numbers: Mapping[tuple[int, int], Any]) -> Solver:
     def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[Any], list[Any]]:
         arrays, right = primals
         arrays_dot, right_dot = tangents
+        # The derivative solves with the same elimination; the tangents of its entries are in `moved`.
         still = {**numbers, **jax.lax.stop_gradient(arrays)}
         elimination = _Elimination(tearing, still, right[0])
         x = solved(arrays, right)
@@ -190,6 +192,8 @@ class _Elimination:
                 for j, v in w.items():
                     terms.setdefault(j, []).append(_product(a, v))
             return {j: _total(t, None) for j, t in sorted(terms.items())}
+        # Beyond what is written out, rows are arrays: a program of scalars would grow with the square of the tearing
+        # variables.
         row = jnp.zeros((len(self.place), *self.like.shape), self.like.dtype)
         if direct:
             values = jnp.stack([self._filled(a) for a in direct.values()])

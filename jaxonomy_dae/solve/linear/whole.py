@@ -47,6 +47,7 @@ def solve_whole(
 
     **Raises:** `ModelError` if there are too many unknowns for dense elimination and KLU is not available.
     """
+    # Entries at one place may cancel, and scales are those of their sum.
     pattern, values = pattern.merged(values)
     n = pattern.n
     by_lapack = solver is None and (n <= LAPACK or not (is_double() and available()))
@@ -114,6 +115,7 @@ def _scales(pattern: SparsePattern, values: Any) -> tuple[Any, Any]:
     size = jnp.abs(values)
     rows = over(jnp.zeros(pattern.n, values.dtype).at[pattern.rows].max(size))
     columns = over(jnp.zeros(pattern.n, values.dtype).at[pattern.cols].max(size * rows[pattern.rows]))
+    # Scaling columns has changed the largest entries of the rows.
     again = over(
         jnp.zeros(pattern.n, values.dtype).at[pattern.rows].max(size * rows[pattern.rows] * columns[pattern.cols])
     )

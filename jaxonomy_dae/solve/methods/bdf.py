@@ -186,6 +186,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         if made_jump is not False:
 
             def restart():
+                # Differences from before a jump predict nothing behind it, so the history begins anew with order 1.
                 moved, _ = consistent_point(problem, self.linear_solver, t0, y)  # algebraic unknowns jump too
                 slope = consistent_slope(problem, self.linear_solver, t0, moved)
                 largest = self._measured(t0, problem.unravel(moved), args)
@@ -211,6 +212,8 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         solved = implicit_step(problem, linear, equation, known, norm, self.root_find_max_steps)
         y1 = solved.y
         if self.projection is not None:
+            # Inside the step rather than around the solver, as for other methods: the projected value enters the
+            # history. Differences of values beside the constraints would lead off them.
             moved = ravel_like(self.projection(t1, problem.unravel(y1), args))
             y1 = jnp.where(solved.converged, moved, y1)
         e = y1 - predicted
@@ -271,6 +274,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         fall = fall & (total > 0)
         accepted = tried.converged & (c.test.astype(dtype) * e_norm < 1.0)
 
+        # Lengths of steps are differences of times, which are rounded.
         same = jnp.abs(tried.h - state.last_step) <= 1e-6 * state.last_step
         steady = jnp.where(same & (k == state.last_order), state.steady, 0)
         steady = jnp.minimum(steady + 1, state.last_order + 2)

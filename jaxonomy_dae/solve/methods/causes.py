@@ -32,6 +32,7 @@ def cause_of(
     "" if none is recognised."""
 
     @jax.jit
+    # Compiled once: a jump is looked for with some twenty evaluations.
     def slope(t, y):
         return consistent_slope(problem, None, t, y)
 

@@ -54,6 +54,7 @@ class ChoiceGuard(eqx.Module):
         """Judges a step by its end."""
         found = self.measure(t, y, args)
         if not self.ends_near:
+            # Only the sign counts: the last determinants stand for the largest.
             return Verdict(jnp.all((found * jnp.sign(largest) > 0) | (largest == 0)), jnp.array(True), found)
         along, size = jnp.sign(largest) * found, jnp.abs(largest)
         nearest = jnp.maximum(NEAREST * size, jnp.minimum(IN_DOUBT * self.atol, 0.1))

@@ -101,6 +101,7 @@ class DAETerm(diffrax.AbstractTerm):
         return self.mass
 
 
+# Masses are compared by content and hashed once, so that one object serves all solves of a size.
 @functools.lru_cache(maxsize=64)
 def _split_mass(n: int, m: int) -> Mass:
     return Mass(np.concatenate([np.ones(n), np.zeros(m)]))
@@ -127,6 +128,8 @@ class FlatProblem:
     """A term as solvers use it: M dy/dt = F(t, y) for a flat y, in the direction of integration."""
 
     def __init__(self, terms: Terms, y: State, args: Args):
+        # Diffrax integrates forwards and wraps the term for a run backwards. Its wrapper knows nothing of mass and
+        # constraint.
         self.term, self.direction = unwrapped(terms)
         self.args = args
         self.terms = terms

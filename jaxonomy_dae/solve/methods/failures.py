@@ -87,6 +87,7 @@ def explain_start(check: StartCheck, names: Sequence[str]) -> str:
         )
     if check.matrix is not None:
         found = null_names(np.asarray(check.matrix), names)
+        # Singular before inconsistent: with a singular matrix the shift is not finite, whatever the residual.
         if found:
             return INDEX.format("singular", found)
     shift = np.abs(np.asarray(check.shift))

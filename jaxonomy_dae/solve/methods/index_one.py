@@ -104,6 +104,7 @@ def consistent_point(
 
     none = chosen.empty(y.shape[0], y.dtype), jnp.asarray(jnp.inf, y.dtype), jnp.ones_like(y)
     found = newton(look, y_still, none, max_steps + 1, SHORTEST)
+    # The search is constant under differentiation, and y itself is not: M y is kept, with its derivative.
     at = y + frozen(found.x - y_still)
     step = _newton_step(problem, linear, t, at, y)
     for _ in range(2):  # with derivatives, written out

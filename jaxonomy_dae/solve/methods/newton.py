@@ -89,6 +89,8 @@ def implicit_step(
     The factorisation at hand serves if its leading coefficient is near; where the iteration then fails, it is made anew
     at the prediction and tried once more. The derivative of y is that of the equation, whatever factorisation was used.
     """
+    # What the equations close over, such as parameters, becomes an argument of the rule below. JAX does not
+    # differentiate what a custom rule closes over.
     right = eqx.filter_closure_convert(problem.right, equation.t, equation.predicted)
     mass = problem.mass
 
@@ -106,6 +108,8 @@ def implicit_step(
             return equation.residual(mass, right, y)
 
         _, change = eqx.filter_jvp(at, (right, equation), tuple(tangents[:2]))
+        # At the solution, not that of the iteration: a stale factorization costs iterations, and must not cost digits
+        # of derivatives.
         _, jacobian = linear.jacobian(lambda v: right(equation.t, v), y)
         matrix = linear.combine(mass, equation.cj.astype(y.dtype), jacobian)
         tangent = linear.solve(linear.factor(matrix), matrix, -change)

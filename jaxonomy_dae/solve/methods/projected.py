@@ -68,11 +68,14 @@ class Projected(WrappedSolver):
             terms, t0, t1, y0, args, solver_state, made_jump
         )
         projected = self.projection(t1, y1, args)
+        # To the error that the solver estimates, since either alone may be small: a step onto another branch has a
+        # small error and a long way back.
         if self.strict and y_error is not None:
             moved = jax.tree.map(lambda a, b: jnp.abs(a - b), projected, y1)
             y_error = jax.tree.map(lambda e, m: jnp.abs(e) + m, y_error, moved)
         if self.guard is not None:
             if made_jump is not False:
+                # Behind a jump the state may be on another branch, where the determinant has another size and sign.
                 largest = jnp.where(made_jump, self.guard.measure(t0, y0, args), largest)
             verdict = self.guard.judge(largest, t1, projected, args)
             if y_error is not None:

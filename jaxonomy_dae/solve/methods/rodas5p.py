@@ -168,6 +168,8 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         h = h_time.astype(dtype)
         # A step of length zero occurs where a batch waits for its slowest member.
         inverse = 1 / jnp.where(h == 0, jnp.asarray(1, dtype), h)
+        # The Jacobian is differentiated, too. The result of a Rosenbrock method depends on it, other than that of a
+        # Newton iteration.
         right, jacobian = linear.jacobian(lambda v: problem.right(t0, v), y)
         slope = jax.jvp(lambda t: problem.right(t, y), (t0,), (jnp.ones_like(t0),))[1]
         # Infinite at the beginning of √t: without it the step is of lower order there, and its error estimate says so.
@@ -186,8 +188,10 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         stages = _in_a_loop(stage, rows, first, h_time.dtype) if looped else _written_out(stage, rows, first)
         y1 = y + _combine(A[7], stages) + stages[7]
         k = jnp.stack([_combine(row, stages) for row in H])
+        # The method is stiffly accurate: the result of order 4 that is embedded differs from y1 by the last stage.
         error = stages[7]
         if self.dense_errors:
+            # Algebraic unknowns are solved for again at saved times, so their dense output need not be good.
             within = mass.differential_part(jax.lax.stop_gradient(stages[8]))
             error = jnp.maximum(jnp.abs(error), jnp.abs(within))
         dense = dict(y0=problem.unravel(y), y1=problem.unravel(y1), k=jax.vmap(problem.unravel)(k))

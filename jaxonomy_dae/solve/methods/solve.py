@@ -243,6 +243,7 @@ def _solve(of: _Given, checked: bool = False):
     integration = Integration(term, solver, t0, t1, None, y0, args, save, of.controller, of.adjoint, of.max_steps)
     run = integrate(integration, checked=checked)
     reached = jnp.isfinite(run.ts) & check.is_fine
+    # The end of the last step is on the constraints already: the methods are stiffly accurate.
     saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
     saved = jax.tree.map(lambda y: not_a_number(y, reached, y0, args), saved)
     failure: Result = diffrax.RESULTS.nonlinear_divergence

@@ -141,6 +141,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
 
         def scaled(a, b, e, atol):
+            # Beside an infinite value every error would be zero, and the step would be kept.
             b = jnp.where(jnp.isfinite(b).all(), b, a)
             return e / (atol + jnp.maximum(jnp.abs(a), jnp.abs(b)) * self.rtol)
 
@@ -167,6 +168,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         spacing = jnp.finfo(t1.dtype).eps * jnp.abs(start)
         tries = jnp.where(keep, jnp.where(t1 - t0 > SHORT * spacing, 0, -tries), tries + 1)
         failed = ~keep & ((dt <= 4 * spacing) | (dt == 0) | (tries > MOST_TRIES))
+        # A length of a few spacings counts as zero: Diffrax would go on with steps that leave time where it is.
         result = diffrax.RESULTS.where(failed, diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful)
         dt = jax.lax.stop_gradient(dt)
         return keep, start, start + dt, False, tries, result

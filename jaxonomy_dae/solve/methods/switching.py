@@ -18,7 +18,8 @@ from ...base.aliases import Numeric, Result, Time
 # Diffrax has no code of its own for this. `breakdown` means nothing else here; an event that writes a value that is not
 # finite ends with `nonlinear_divergence`, too, and its run was made once more with an implicit solver.
 STIFF: Result = diffrax.RESULTS.breakdown
-BOUNDARY = 0.9 * 3.5  # of Tsit5's stability region along the negative real axis is at −3.5
+# Nine tenths of the way to the boundary of Tsit5's stability region, which along the negative real axis is at −3.5.
+BOUNDARY = 0.9 * 3.5
 PATIENCE = 15  # limited steps in a row, as in Hairer's DOPRI5: a transient that passes is not stiffness
 # Steps of that size still to be taken: fewer cost less than compiling another solver
 # (test_default_solver.py::test_fast_decay_before_a_short_end_stays_explicit).
@@ -57,7 +58,7 @@ class Watch(eqx.Module):
         """The counts after a step from t0 to t1, whose last two stages are at points y with increments k = h·f(y)."""
         end, floor, t0, t1, y, k = jax.lax.stop_gradient((self.end, self.floor, t0, t1, y, k))
         weight = floor + jnp.abs(y[1])
-        # One sum, not one for each norm: small steps cost what the kernels in them are.
+        # One sum rather than two norms that are compared: a small step costs as much as it has kernels.
         excess = jnp.sum(((k[1] - k[0]) ** 2 - BOUNDARY**2 * (y[1] - y[0]) ** 2) / weight**2)
         count, steps = counts[0], counts[1]
         left = (self.many - steps if self.of_run else jnp.full_like(steps, self.many)).astype(jnp.asarray(t1).dtype)

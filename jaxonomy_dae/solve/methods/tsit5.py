@@ -65,6 +65,7 @@ class Tsit5(diffrax.Tsit5):
         `slope` is the last slope of the step before."""
         tableau = self.tableau
         if made_jump is not False:
+            # Behind a jump the last slope of the step before is that of another field.
             slope = jax.lax.cond(made_jump, lambda _: terms.vf(t0, y0, args), lambda s: s, slope)
         k, points = [terms.prod(slope, control)], [y0]
         for a, c in zip(tableau.a_lower, tableau.c, strict=True):
