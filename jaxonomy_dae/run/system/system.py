@@ -575,6 +575,9 @@ class AcausalSystem(eqx.Module):
         *,
         outputs: Sequence[str] | None = None,
         parameters: Sequence[str] | str = "all",
+        fmi: int = 3,
+        arrays: bool = False,
+        dae: bool = False,
         kinds: Sequence[str] | None = None,
         platforms: Sequence[str] | str | None = None,
         stop_time: float = 1.0,
@@ -586,8 +589,8 @@ class AcausalSystem(eqx.Module):
         from ...fmi.export import export_fmu
 
         return export_fmu(
-            self, path, outputs=outputs, parameters=parameters, kinds=kinds, platforms=platforms,
-            stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
+            self, path, outputs=outputs, parameters=parameters, fmi=fmi, arrays=arrays, dae=dae, kinds=kinds,
+            platforms=platforms, stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
         )  # fmt: skip
 
     def to_c(
@@ -607,6 +610,13 @@ class AcausalSystem(eqx.Module):
             self, path, outputs=outputs, functions=functions, stop_time=stop_time, tolerance=tolerance,
             overwrite=overwrite,
         )  # fmt: skip
+
+    def to_casadi(self, *, outputs: Sequence[str] | None = None) -> Any:
+        """This system as a `casadi.Function` of time, states, algebraic unknowns, discrete values, parameters and
+        inputs: see `jaxonomy_dae.fmi.to_casadi`, which has the same argument."""
+        from ...fmi.to_casadi import to_casadi
+
+        return to_casadi(self, outputs=outputs)
 
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
         if isinstance(solve_for, str):
