@@ -117,6 +117,8 @@ class Leftover:
         """Residuals as a right model would leave them."""
         left, sizes = self._factors
         noise, own = rng.standard_normal((count, len(self.share))), rng.standard_normal((count, len(sizes)))
+        # `own` is the noise of the priors. With it, the covariance of what is left is exactly I − L Lᵀ. Without priors
+        # the sizes are one, and nothing is added.
         taken = sizes * ((self.share * noise) @ left) + np.sqrt(1 - sizes**2) * own
         return noise - (taken * sizes) @ left.T / self.share
 

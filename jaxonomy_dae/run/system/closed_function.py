@@ -88,6 +88,8 @@ def closed_function(function: Callable[[Any], Any], dtype: Any) -> ClosedFunctio
 def _with_numbers_lifted(jaxpr: Any) -> tuple[Any, list[Any]]:
     """The numbers written in a program become constants, so that other numbers are not another program."""
     literal = private("Literal")
+    # Only numbers at the top level are lifted. Those inside loops and inner functions stay part of the program, so
+    # another number there is compiled anew.
     atoms = [atom for equation in jaxpr.eqns for atom in equation.invars] + list(jaxpr.outvars)
     lifted = [atom for atom in atoms if isinstance(atom, literal) and _is_data(atom)]
     if not lifted:
@@ -188,6 +190,7 @@ def _key(value: Any, inside: tuple[Hashable, ...] = ()) -> Hashable:
         hash(value)
     except TypeError:
         return _Same(value)
+    # With the type, because 1, 1.0 and True are equal in Python, and are different parameters of a primitive.
     return type(value), value
 
 
