@@ -24,10 +24,10 @@ PLACES = 24  # at which a step of a disturbance is tried
 # An input is read at so many times between two samples.
 PARTS = 16
 EDGE = 4  # samples on each side of a step
-# Of a column's square. Where less is left of it beside the model's own numbers, these take it up.
+# The model's own numbers take up a column of whose square less than this part is left beside them.
 TAKEN = 1e-4
 DAY = 86400.0  # s
-# Of its size. A state changes its sign if it goes beyond zero by this much on both sides.
+# A state changes its sign if it goes beyond zero by this part of its size on both sides.
 TURNS = 0.02
 FORM = 4  # coefficients of a polynomial that stands for a law of another form
 DAYS = 2  # in a record, from which a daily disturbance is looked for

@@ -193,6 +193,7 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mappin
         outputs=tuple(outputs),
         times=times,
         t0=np.array([one.t0 for one in experiments], float),
+        # What is missing is zero and has the weight zero: not-a-number times zero would not vanish.
         values=np.where(observed, values, 0.0),
         observed=observed,
         sigma=levels,
@@ -288,6 +289,7 @@ def _samples(name: str, source: object, one: Experiment, label: str) -> tuple[np
     """(times, values, kind) of an input; a constant is of any kind."""
     end = float(one.times[-1])
     if isinstance(source, int | float | np.number):
+        # Two times that differ, even for a record of a single sample at its start.
         return np.array([one.t0, max(end, one.t0 + 1.0)]), np.full(2, float(source)), None
     if not isinstance(source, tuple | list) or len(source) not in (2, 3):
         raise ModelError(
@@ -319,6 +321,7 @@ def _samples(name: str, source: object, one: Experiment, label: str) -> tuple[np
 
 def _beyond(times: np.ndarray, m: int) -> np.ndarray:
     """Times continued to m of them, in steps like the last."""
+    # Interpolations need times that increase, so the last one cannot be repeated.
     step = times[-1] - times[-2]
     return np.concatenate([times, times[-1] + step * np.arange(1, m - len(times) + 1)])
 

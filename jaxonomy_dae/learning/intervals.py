@@ -59,6 +59,7 @@ def profile(
         cost = np.inf if reached is None else reached.cost
         if reached is not None:
             warm[0] = reached.z
+        # Finite where a run fails, since the search for a root needs numbers.
         return min(cost + own_cost - best, 1e6) - allowed
 
     centre = float(point[position])

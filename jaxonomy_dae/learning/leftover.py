@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 # The share of right models that is doubted: fewer than one in twenty, whatever other reasons add.
 LEVEL = 0.02
-# Of residuals, so that the level is a whole number of them. All fits of a model have the same draws: with 499 of these,
-# the level of one oscillator was 3.1 %.
+# So many sets of residuals are drawn that the level is a whole number of them. All fits of a model have the same draws:
+# with 499 of them, the level of one oscillator was 3.1 %.
 DRAWS = 1999
 SURE = 499  # draws after which a third of the level counts as below it: the level itself looks so once in 300 times
 BATCH = 50  # draws at once: most right models are known by the first

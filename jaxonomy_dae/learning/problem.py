@@ -53,8 +53,8 @@ from .training import GradientSteps, Training, train
 from .verdict import FitWarning
 
 GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
-# Starts of a network that follow where χ² is improbable: of four fits of Stribeck's friction, two end in a local
-# minimum, so that of three starts all do in one of eight.
+# So many more starts of a network follow where χ² is improbable. Of four fits of Stribeck's friction, two end in a
+# local minimum, so that all of three starts do in one of eight cases.
 AGAIN = 2
 MORE = 4  # the same of parameters alone: of 30 records of two tanks, a third ended in a local minimum
 ENOUGH = 100  # evaluations of these, unless the search before took more: they cost no more than it did

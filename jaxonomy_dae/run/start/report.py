@@ -286,7 +286,7 @@ class InitializationReport(Sections):
 
     def _examine(self):
         with jax.ensure_compile_time_eval():
-            # Those of a system whose parameters were solved for belong to the values before.
+            # If parameters were solved for, the system's typical sizes belong to the values before, and are found anew.
             sizes = None if self.solved else np.asarray(self._system.typical_sizes, float)
             yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read, sizes, SUSPICIOUS)
 

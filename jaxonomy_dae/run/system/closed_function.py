@@ -41,8 +41,8 @@ class _Program:
         return self._content.digest, tuple(map(Hidden, self._content.unseen))
 
 
-# By what they are made of. Parts of a key are programs of their own, so that keys stay flat: the rules for derivatives
-# of a user's checks contain each other, and as nested tuples they were too deep to be compared.
+# All programs, by what they are made of. Parts of a key are programs of their own, so that keys stay flat: the rules
+# for derivatives of a user's checks contain each other, and as nested tuples they were too deep to be compared.
 _PROGRAMS: weakref.WeakValueDictionary[Hashable, _Program] = weakref.WeakValueDictionary()
 
 
