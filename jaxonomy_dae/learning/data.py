@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
-from ..base.errors import ModelError, nearest
+from ..base.errors import ModelError, explained_keywords, nearest
 from ..compile.lowering.plan import SystemPlan
 from ..run.system.inputs import KINDS
 from .axes import LEGEND, AxesGiven, chosen_names, grid_of_axes
@@ -23,6 +23,7 @@ class Data:
     They may differ in length, sampling and measured variables. All of them must name the same inputs and starts.
     """
 
+    @explained_keywords({"experiments": "Data(first, second)"})
     def __init__(self, *experiments: Experiment):
         for k, one in enumerate(experiments):
             if not isinstance(one, Experiment):
@@ -133,6 +134,14 @@ class Stacked:
                 f"the noise of '{self.outputs[coloured[0]]}' is correlated, rho, which {what} does not take: use "
                 "fit() with method='single', or leave it out"
             )
+
+    def input_at(self, name: str, experiment: int, at: np.ndarray) -> np.ndarray:
+        """An input of an experiment at some times: samples that are held, or curves as if they were straight between
+        them."""
+        times, values = (part[experiment] for part in self.inputs[name])
+        if dict(self.kinds)[name] != "held":
+            return np.interp(at, times, values)
+        return values[np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)]
 
     def until(self, share: float) -> "Stacked":
         """A copy of the same shapes in which only this share of each experiment's time counts."""
