@@ -108,12 +108,14 @@ def exported(system, folder, name="model", **options):
 def discrete_values(system, fmu):
     """The discrete variables of an FMU: hidden ones of a Modelica model, which it does not show, are what they are
     between two events."""
-    if all(name in fmu.reference for name in system.discretes):
-        return [float(fmu.get(name)[0]) for name in system.discretes]
-    started = dict(zip(system.discretes, simulate(system, 1e-9).at(-1).discrete.tolist(), strict=False))
-    shown = {name: float(fmu.get(name)[0]) for name in started if name in fmu.reference}
-    before = {name: shown[name.replace(":pre(", "").rstrip(")")] for name in started if ":pre(" in name}
-    return [*(started | shown | before).values()]
+    shown = [float(fmu.get(name)[0]) for name in system.discretes]
+    hidden = system.every_discrete[len(shown) :]
+    if not hidden:
+        return shown
+    between = dict(zip(system.every_discrete, simulate(system, 1e-9).at(-1).discrete.tolist(), strict=False))
+    values = between | dict(zip(system.discretes, shown, strict=True))
+    before = {name: values[name.replace(":pre(", "").rstrip(")")] for name in hidden if ":pre(" in name}
+    return [*shown, *((values | before)[name] for name in hidden)]
 
 
 def point(system, fmu, outputs):

@@ -183,7 +183,7 @@ class _Variables(Content):
     def _parameters(self, parameters: Sequence[str] | str) -> tuple[list[str], list[int]]:
         """The names of parameters, and the places of weights, that can be set."""
         system, table = self.system, self.system.parameters.table
-        discrete = set(self.discretes)
+        discrete = set(system.every_discrete)
         settable = [n for k, n in enumerate(table.names) if k not in table.expressions and n not in discrete]
         if isinstance(parameters, str) and parameters == "all":
             return settable, list(range(len(self.programs.weights)))

@@ -287,14 +287,14 @@ class AcausalSystem(eqx.Module):
             shown = picked(array, (..., table.discrete[: len(table.discrete) - table.n_relations]))
             return joined([array, hidden, shown, hidden])
         values = self.discrete_values
-        return joined([array, picked(values, (..., slice(events.n_visible, None))), values])
+        return joined([array, picked(values, (..., slice(events.n_declared, None))), values])
 
     def holding(self, values: Any) -> "AcausalSystem":
         """The system with these values of its discrete variables, followed by the hidden ones."""
         events = self.plan.events
         if events is None or not len(events.discrete):
             return self
-        n, chosen = events.n_visible, events.discrete[: events.n_visible]
+        n, chosen = events.n_declared, events.discrete[: events.n_declared]
         array = self.parameters.array
         if n:
             array = complete(events.dependents, array.at[chosen].set(values[:n]))
@@ -316,16 +316,22 @@ class AcausalSystem(eqx.Module):
         if events is None:
             return jnp.zeros((0,))
         array = self.parameters.array
-        visible = picked(array, (..., events.discrete[: events.n_visible]))
-        starts = np.asarray(self.plan.flat.parameters.starts_of(events.discrete[events.n_visible :]), array.dtype)
-        hidden = np.broadcast_to(starts, (*visible.shape[:-1], len(starts)))
-        return joined([visible, hidden if self.modes is None else self.modes])
+        declared = picked(array, (..., events.discrete[: events.n_declared]))
+        starts = np.asarray(self.plan.flat.parameters.starts_of(events.discrete[events.n_declared :]), array.dtype)
+        hidden = np.broadcast_to(starts, (*declared.shape[:-1], len(starts)))
+        return joined([declared, hidden if self.modes is None else self.modes])
 
     @property
     def discretes(self) -> list[str]:
         """The names of the discrete variables."""
+        return self.every_discrete[: 0 if self.plan.events is None else self.plan.events.n_visible]
+
+    @property
+    def every_discrete(self) -> list[str]:
+        """The names of the declared discrete variables, followed by those that the package has added to a component,
+        such as what a variable of a Modelica model was in the iteration before."""
         events = self.plan.events
-        return [] if events is None else [self.parameters.names[p] for p in events.discrete[: events.n_visible]]
+        return [] if events is None else [self.parameters.names[p] for p in events.discrete[: events.n_declared]]
 
     def vector_field(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""
