@@ -11,7 +11,8 @@ v4.1.0: functions that a text calls but does not hold are read from it. None of 
 Each file runs in a process of its own, with limits of time and memory. A run agrees if each reference signal (those of
 `comparisonSignals.txt`, or all) is within 0.2 % of its range, where values may also be those within 0.2 % of the run's
 time before or after. A gradient is that of the sum of squares of the signals at the end, by two parameters, in reverse
-mode beside central differences. Lines of JSON go to `--out`, and a table by sub-library to the standard output.
+mode beside central differences. Lines of JSON go to `--out`, each with the commit on which it was made, and a table by
+sub-library, with a row for each text, to the standard output.
 """
 
 import argparse
@@ -21,6 +22,7 @@ import multiprocessing
 import os
 import re
 import resource
+import subprocess
 import sys
 import time
 import warnings
@@ -40,6 +42,7 @@ AGREES = 0.002  # of a signal's range, and of the run's time
 POINTS = 1000  # the most saved times
 STEPS = (1e-5, 1e-3, 1e-2)  # of a parameter, for differences: of longer steps, the runs' own errors count less
 CLOSE = 1e-3  # relative error of a gradient that counts as right
+SAID = 120  # letters of a message in the list of texts
 
 
 def main() -> int:
@@ -47,15 +50,16 @@ def main() -> int:
     files = sorted(Path(asked.texts).rglob("Modelica.*.bmo"), key=lambda f: f.stat().st_size)
     files = [f for f in files if asked.only in f.name]
     done = {r["model"]: r for r in _read(asked.out)} if asked.resume else {}
+    commit = asked.commit or _commit()
     for k, file in enumerate(files):
         if file.stem in done:
             continue
-        row = _in_a_process(file, asked)
+        row = _in_a_process(file, asked) | {"commit": commit}
         done[file.stem] = row
         with open(asked.out, "a", encoding="utf-8") as out:
             out.write(json.dumps(row) + "\n")
         print(f"{k + 1}/{len(files)} {file.stem}: {_short(row)}", file=sys.stderr, flush=True)
-    page = _page(list(done.values()), len(files))
+    page = _page([done[f.stem] for f in files], len(files))
     print(page)
     if asked.page:
         Path(asked.page).write_text(page, encoding="utf-8")
@@ -72,8 +76,14 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--resume", action="store_true", help="leave out what is in --out already")
     parser.add_argument("--page", help="a file for the tables, in Markdown")
     parser.add_argument("--no-gradients", action="store_true")
+    parser.add_argument("--commit", default="", help="of this tree, where it is not a checkout")
     parser.add_argument("--seconds", type=int, default=SECONDS, help="of processor time, for each file")
     return parser.parse_args()
+
+
+def _commit() -> str:
+    asked = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(asked, capture_output=True, text=True).stdout.strip()
 
 
 def _in_a_process(file: Path, asked: argparse.Namespace) -> dict:
@@ -89,9 +99,9 @@ def _in_a_process(file: Path, asked: argparse.Namespace) -> dict:
     except EOFError:
         child.join()
     if child.exitcode in (-9, -24):
-        row |= {"error": "late", "seconds": asked.seconds}
+        row |= {"error": "late", "kind": "late", "seconds": asked.seconds}
     elif child.exitcode:
-        row["error"] = f"the process ended with {child.exitcode}"
+        row |= {"error": f"the process ended with {child.exitcode}", "kind": "process"}
     return row
 
 
@@ -116,9 +126,9 @@ def _rows(file: Path, references: Path, gradients: bool, roots: Sequence[str] = 
             row[f"until_{stage}"] = row["seconds"] = round(time.process_time() - start, 2)
             yield row
     except MemoryError:
-        row["error"] = "memory"
+        row |= {"error": "memory", "kind": "memory"}
     except Exception as error:
-        row["error"] = f"{type(error).__name__}: {error}"[:600]
+        row |= {"error": f"{type(error).__name__}: {error}"[:600], "kind": type(error).__name__}
     row["seconds"] = round(time.process_time() - start, 2)
     yield row
 
@@ -148,26 +158,23 @@ def _stages(file: Path, references: Path, gradients: bool, row: dict, roots: Seq
     row["steps"] = int(solution.stats["num_steps"])
     yield "run"
     if not len(data):
-        row["error"] = "no reference"
+        row["kind"] = "no reference"
         return
     ours = _signals(solution, system, names[1:])
     columns = zip(names[1:], ours, data.T[1:], strict=True)
     errors = sorted(((_deviation(np.asarray(ts), o, data[:, 0], r), name) for name, o, r in columns), reverse=True)
     row["worst"] = errors[:3]
     if errors[0][0] > AGREES:
-        row["error"] = f"deviates: {errors[0][1]} by {errors[0][0]:.3g} of its range"
+        row |= {"error": f"{errors[0][1]} by {errors[0][0]:.3g} of its range", "kind": "deviates"}
         return
     yield "agrees"
     if gradients:
         signals = [f"m.{n}" for n in names if f"m.{n}" in system.variables]
         fixed = [f"m.{n}" for n, v in component.variables.items() if v.fixed and f"m.{n}" in system.states]
-        row["gradient"] = _gradient(system, signals, fixed, begin, end, rtol)
-        if row["gradient"] is None:
-            row["error"] = "no parameter and no start to differentiate by"
-        elif row["gradient"] <= CLOSE:
+        row |= _gradient(system, signals, fixed, begin, end, rtol)
+        if row["kind"] == "gradient":
+            del row["kind"]
             yield "gradient"
-        else:
-            row["error"] = f"the gradient is off by {row['gradient']:.3g}"
 
 
 def _compiled(component: FlatComponent, outputs: list[str]) -> tuple[FlatComponent, AcausalSystem]:
@@ -225,17 +232,17 @@ def _deviation(ts, ours, times, theirs) -> float:
     return float(away.max()) / size
 
 
-def _gradient(system, names: list[str], fixed: list[str], begin: float, end: float, rtol: float) -> float | None:
-    """The relative error of the derivatives of the sum of squares of the signals at the end, by up to two parameters or
-    fixed starts: reverse mode against central differences, by longer steps where those of short ones are far. None if
-    there is none of these."""
+def _gradient(system, names: list[str], fixed: list[str], begin: float, end: float, rtol: float) -> dict:
+    """The relative error, "gradient", of the derivatives of the sum of squares of the signals at the end, by up to two
+    parameters or fixed starts: reverse mode against central differences, by longer steps where those of short ones are
+    far. "by" says what they are taken by, "kind" whether they are right: zeros on both sides are not counted so."""
     values = system.parameters
     computed = {int(k) for group in values.table.dependents for k in group.target}
     settable = [n for k, n in enumerate(values.names) if k not in computed and not n.startswith("m.:")]
     by = [n for n in settable if float(values[n])][:2]
     starts = fixed[: 2 - len(by)]
     if not (by or starts) or not names:
-        return None
+        return {"kind": "nothing to differentiate by"}
     tight = min(rtol, 1e-9)
     point = simulate(system, end, t0=begin, ts=jnp.array([begin]))
 
@@ -250,18 +257,20 @@ def _gradient(system, names: list[str], fixed: list[str], begin: float, end: flo
 
     at = jnp.array([*(float(values[n]) for n in by), *(float(point[n][0]) for n in starts)])
     found = jax.jit(jax.grad(loss))(at)
-    worst = 0.0
+    worst, moves = 0.0, False
     for k in range(len(at)):
         size, error = abs(float(at[k])) or 1.0, np.inf
         for step in STEPS:
             h = step * size
             slope = (loss(at.at[k].add(h)) - loss(at.at[k].add(-h))) / (2 * h)
+            moves = moves or float(slope) != 0
             scale = max(abs(float(slope)), 1e-3 * abs(float(loss(at))) / size)
             error = min(error, abs(float(found[k] - slope)) / max(scale, 1e-300))
             if error <= CLOSE:
                 break
         worst = max(worst, error)
-    return worst
+    kind = "gradient off" if not worst <= CLOSE else "gradient" if moves else "gradient of zero"
+    return {"gradient": worst, "by": "parameters" if by else "starts", "kind": kind}
 
 
 def _read(file: str) -> list[dict]:
@@ -276,26 +285,21 @@ def _short(row: dict) -> str:
 
 
 STAGES = ("read", "translated", "compiled", "run", "agrees", "gradient")
-CLASSES = (  # of reasons: what an error says, and what that means
-    ("not run", "is read, or translated; it has not been run yet"),
-    ("no reference", "runs, but there is no reference result of moderate size"),
-    ("no parameter and no start", "agrees, but has nothing to differentiate by: the text has numbers for parameters"),
-    ("the gradient is off", "the gradient is not that of differences"),
-    ("deviates", "deviates from the reference"),
-    ("written in C", "calls a function in C, such as the reader of a file, or draws from a global random generator"),
-    ("expected a class|unknown character", "the text is empty or broken"),
-    ("the function .* is not known", "calls a function whose definition the text does not hold"),
-    ("delay", "needs `delay`"),
-    ("late", "takes more processor time than it is given"),
-    ("memory", "takes more memory than it is given"),
-    ("turning point|pole", "stops at a turning point: the solution jumps to another branch without a law for the jump"),
-    ("chattering|stays where|chatter", "stops where a condition turns back and forth"),
-    ("max_steps", "takes more steps than it may"),
-    ("SimulationError", "stops for another reason"),
-    ("InitializationError", "no consistent start is found"),
-    ("StructuralError|singular", "the compiler calls it singular"),
-    ("", "a construct that is not translated"),
-)
+KINDS = {  # why a text does not reach the last stage: what a stage found, or the class of the error that ended it
+    "ModelError": "a construct that is not read, or what the text asks for is refused by name (ModelError)",
+    "StructuralError": "the compiler calls it singular (StructuralError)",
+    "InitializationError": "no consistent start is found (InitializationError)",
+    "SimulationError": "the run stops before its end (SimulationError)",
+    "late": "takes more processor time than it is given",
+    "memory": "takes more memory than it is given",
+    "process": "the process was ended",
+    "no reference": "runs, but there is no reference result of moderate size",
+    "deviates": "deviates from the reference",
+    "not asked": "agrees; it was not differentiated",
+    "nothing to differentiate by": "agrees, but has nothing to differentiate by: the text has numbers for parameters",
+    "gradient of zero": "agrees, and the derivatives that were tried are zero on both sides",
+    "gradient off": "the gradient is not that of differences",
+}
 EXPLAINED = {
     "Electrical.Machines.Examples.SynchronousMachines.SMPM_NoLoad": "an angle that turns from π to -π, saved on "
     "one side of the turn or on the other",
@@ -350,10 +354,18 @@ def _page(rows: list[dict], files: int) -> str:
     for row in rows:
         of[".".join(row["model"].split(".")[1:3])].append(row)
     head = ("sub-library", "tried", *STAGES)
+    commits = ", ".join(f"`{c}`" for c in sorted({r.get("commit", "") for r in rows} - {""}))
+    right = [r for r in rows if r.get("reached") == "gradient"]
+    zero, off, nothing = (
+        sum(r.get("kind") == kind for r in rows)
+        for kind in ("gradient of zero", "gradient off", "nothing to differentiate by")
+    )
     lines = [
         HEAD,
-        f"Of {files} texts, {sum(r.get('error') != 'not run' for r in rows)} have been tried. Of the runs "
-        f"that agree, {sum(r.get('gradient') is not None for r in rows)} have been differentiated.",
+        f"{len(rows)} of {files} texts were run on commit {commits or 'unknown'}. Of the gradients that were tried, "
+        f"{sum(r['by'] == 'parameters' for r in right)} by parameters and {sum(r['by'] == 'starts' for r in right)} by "
+        f"starts are right, {off} are not, and {zero} are zero on both sides; {nothing} texts have nothing to "
+        "differentiate by.",
         "",
     ]
     lines += ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
@@ -366,7 +378,7 @@ def _page(rows: list[dict], files: int) -> str:
             "",
             f"Median of the first run, compilation included: {seconds[len(seconds) // 2]:.1f} processor seconds.",
         ]
-    reasons = collections.Counter(_reason(r["error"]) for r in rows if "error" in r)
+    reasons = collections.Counter(_kind(r) for r in rows if _kind(r))
     plain = [r for r in rows if r.get("plain")]
     run, agree = (sum(f"until_{stage}" in r for r in plain) for stage in ("run", "agrees"))
     lines += [
@@ -375,7 +387,7 @@ def _page(rows: list[dict], files: int) -> str:
         f"delays: of these, {run} run and {agree} agree.",
     ]
     lines += ["", "## Why the others do not", "", "| files | reason |", "|---|---|"]
-    lines += [f"| {n} | {why} |" for why, n in reasons.most_common()]
+    lines += [f"| {n} | {KINDS.get(kind, kind)} |" for kind, n in reasons.most_common()]
     lines += ["", "## Deviations", ""]
     far = [
         (r["worst"][0], r["model"].removeprefix("Modelica."))
@@ -388,12 +400,17 @@ def _page(rows: list[dict], files: int) -> str:
     off = [r["model"].removeprefix("Modelica.") for r in rows if r.get("gradient", 0.0) and r["gradient"] > CLOSE]
     lines += ["", "## Gradients that are not those of differences", ""]
     lines += [f"- `{m}`: {EXPLAINED_GRADIENTS.get(m, 'not looked into')}." for m in off] or ["None."]
+    lines += ["", "## Text by text", "", "| text | reaches | because |", "|---|---|---|"]
+    for r in rows:
+        said = r.get("error", "").split("\n")[0].replace("|", "\\|")[:SAID]
+        why = f"{_kind(r)}: {said}" if said and said != _kind(r) else _kind(r)
+        lines.append(f"| {r['model'].removeprefix('Modelica.')} | {r['reached']} | {why} |")
     return "\n".join(lines) + "\n"
 
 
-def _reason(error: str) -> str:
-    """The class of an error."""
-    return next(why for pattern, why in CLASSES if re.search(pattern, error, re.S))
+def _kind(row: dict) -> str:
+    """Why a text did not reach the last stage; "" if it did."""
+    return row.get("kind", "not asked" if row["reached"] == "agrees" else "")
 
 
 if __name__ == "__main__":

@@ -116,7 +116,7 @@ def _between_ticks(system: AcausalSystem, partials: Partials) -> Partials:
         events: Any = resting_events(system.plan)
         plan = system.plan.some_events
         place = events.unknown[np.flatnonzero(np.asarray(depends))]
-        names = some([repr(system.discretes[k]) for k in place.tolist()])
+        names = some([repr(system.every_discrete[k]) for k in place.tolist()])
         rows = events.ticking[np.isin(plan.table.discrete[events.ticking], place)]
         clocks = some([repr(t) for t in dict.fromkeys(plan.names[e] for e in plan.table.event[rows].tolist())])
         raise ModelError(

@@ -96,7 +96,7 @@ def sampled_space(system: AcausalSystem, point: Driven, partials: Partials, coor
                          "linear model yet")  # fmt: skip
     whole, read = jnp.where(fine, whole, jnp.nan), jnp.where(fine, read, jnp.nan)
     places = slice(len(kept) + k, len(kept) + k + m)
-    names = (*(system.states[c] for c in kept), *(system.discretes[c] for c in events.unknown.tolist()))
+    names = (*(system.states[c] for c in kept), *(system.every_discrete[c] for c in events.unknown.tolist()))
     return StateSpace(
         whole[inner, inner], whole[inner, places], read[:, inner], read[:, places],
         jnp.append(point.x[:n][kept], point.q[events.unknown]), point.u, partials.outputs + read[:, -1],

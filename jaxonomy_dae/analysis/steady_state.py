@@ -257,7 +257,7 @@ def _enough(system: AcausalSystem, found: Equilibrium, drifting: Drifting) -> st
 def _unknown_names(system: AcausalSystem, drifting: Drifting) -> list[str]:
     every = [*system.states, *system.carried]
     events = resting_events(system.plan, drifting.discrete, drifting.states)
-    sampled = [] if events is None else [system.discretes[k] for k in events.unknown.tolist()]
+    sampled = [] if events is None else [system.every_discrete[k] for k in events.unknown.tolist()]
     return [every[k] for k in unknowns(system.plan, drifting.states)] + sampled
 
 
@@ -280,4 +280,4 @@ def _written_names(system: AcausalSystem, drifting: Drifting) -> list[str]:
     table = plan.events.table
     states = [system.states[plan.events.state[k]] if plan.events.state[k] >= 0 else "" for k in events.ticking]
     values = [int(k) for k in table.discrete[events.ticking]]
-    return [state or system.discretes[k] for state, k in zip(states, values, strict=True)]
+    return [state or system.every_discrete[k] for state, k in zip(states, values, strict=True)]

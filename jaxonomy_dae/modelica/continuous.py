@@ -3,6 +3,7 @@
 import sympy
 
 from ..base.errors import ModelError
+from .assertions import write_assertion
 from .definitions import OfAlgorithm
 from .scope import Scope
 from .tree import Branches, Effect, Equality, Expression, Several, Statement
@@ -19,6 +20,8 @@ def write_equation(scope: Scope, s: Statement) -> None:
     elif isinstance(s, Effect):
         if s.call.function == "connect":
             raise ModelError("connect(…) is not flat: Modelica with connections is read by load(source, model=…)")
+        if s.call.function == "assert":
+            write_assertion(scope, s.call)
     else:
         raise ModelError("a loop of equations is not read")
 

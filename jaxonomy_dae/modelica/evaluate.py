@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 import sympy
@@ -27,6 +27,7 @@ class Evaluator:
     - `special`: calls that only the model can answer, such as `pre`, by name: from the arguments as written.
     - `externals`: functions in place of those that are written in C, by name.
     - `named`: gives an expression of a function a name, so that what is read several times stands once.
+    - `opaque`: the results of a function of JAX, so many, from the values of its arguments.
     - `entries`: the places of the entries that are declared one by one, by the name of their array.
     """
 
@@ -38,13 +39,14 @@ class Evaluator:
         externals: Mapping[str, Callable[..., Value]],
         entries: Mapping[str, list[tuple[int, ...]]] | None = None,
         named: Callable[[sympy.Expr], Value] = lambda e: e,
+        opaque: Callable[[Callable, Sequence[Value], int], Sequence[Value]] = lambda *_: (),
     ):
         self.classes, self.names, self.entries = classes, names, entries or {}
         self.special, self.externals = special, externals
         self.literals = literal_numbers(classes)
         self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
         self.quieted: set[sympy.Basic] = set()  # conditions that stood in noEvent
-        self.named = named
+        self.named, self.opaque = named, opaque
         self.depth = 0
         self.guards: list[Value] = []  # conditions that are not constant, around what is carried out
 

@@ -6,7 +6,6 @@ from ..base.errors import ModelError, nearest
 from ..write.component import Component
 from ..write.environment import EqnEnv
 from .continuous import write_equation
-from .discrete_map import DiscreteMap
 from .flat_model import FlatModel
 from .laws import equation_of, write_law
 from .scope import Scope, located
@@ -53,13 +52,13 @@ class FlatComponent(Component):
         replaced = {variable: equation_of(scope, variable) for variable in flat.laws}
         equations = [s for s in found.equations if not any(s is r.statement for r in replaced.values())]
         equations = with_chains_solved(equations, scope.interpreter.name_of)
-        discrete = DiscreteMap(scope)
+        discrete = scope.discrete
         for name in found.followed:
-            located(flat.name, scope.declared[name].line, read_followed, discrete, name)
+            located(flat.name, scope.declared[name].line, read_followed, scope, name)
         for s in found.whens:
-            located(flat.name, s.line, read_when, discrete, s)
+            located(flat.name, s.line, read_when, scope, s)
         for section in found.sections:
-            located(flat.name, section[0].line, read_section, discrete, section)
+            located(flat.name, section[0].line, read_section, scope, section)
         discrete.share_relations()
         for write, statements in (
             (write_equation, equations),

@@ -1,7 +1,7 @@
 """Carries out the functions and algorithms of a flat Modelica text, statement by statement.
 
 An `if` whose condition is not constant is carried out in both branches, and a choice joins what they assign. Loops must
-have constant bounds.
+have constant bounds, but for `while`: one whose condition is not constant is repeated when the model is computed.
 """
 
 from collections.abc import Mapping
@@ -12,8 +12,10 @@ import sympy
 from ..base.errors import ModelError, nearest
 from . import tree
 from .builtin import FUNCTIONS, applied, filled
+from .definitions import assigned_in
 from .evaluate import Evaluator, Names, index_of, local_names, with_end
-from .values import Record, Results, Value, chosen, either, negated
+from .loops import JUMPS, at, carried, placed, repeated
+from .values import Record, Results, Value, as_number, both, chosen, either, is_condition, negated
 
 MOST_ROUNDS = 100_000  # of a loop that is carried out while the model is read
 LONG = 30  # nodes of an expression of a function that gets a name; a sum of three products has ten
@@ -233,13 +235,40 @@ class Interpreter(Evaluator):
 
     def _while(self, condition: tree.Expression, body: tuple, local: dict[str, Value], names: Names) -> None:
         for _ in range(MOST_ROUNDS):
-            holds = self.evaluate(condition, names)
+            holds = both(self.evaluate(condition, names), negated(either(*(local.get(j, False) for j in JUMPS))))
             if not isinstance(holds, bool):
-                raise ModelError(f"the condition of a while loop must be constant; got {holds}")
-            if not holds or local.get("return") is True or local.get("break") is True:
+                self._repeated(condition, body, local, names)
+                return
+            if not holds:
                 return
             self.execute(body, local, names)
         raise ModelError(f"a while loop takes more than {MOST_ROUNDS} rounds")
+
+    def _repeated(self, condition: tree.Expression, body: tuple, local: dict[str, Value], names: Names) -> None:
+        """A loop of which it is not known how often it is carried out."""
+        written = [e for e in tree.each_part(body) if isinstance(e, tree.Jump)]
+        changed = [name.partition("[")[0].partition(".")[0] for name in assigned_in(body)]
+        for jump in {e.kind for e in written}:
+            local.setdefault(jump, False)
+            changed.append(jump)
+        state = carried(list(dict.fromkeys(changed)), local)
+        inside = dict(local)
+        placed([(c.path, c.value) for c in state if c.before is not None], inside)
+        named, guards, self.named, self.guards = self.named, self.guards, lambda e: e, []
+        try:
+            within = local_names(inside, names)
+            ended = either(*(inside.get(j, False) for j in JUMPS))
+            goes_on = both(self.evaluate(condition, within), negated(ended))
+            self.execute(body, inside, within)
+        finally:
+            self.named, self.guards = named, guards
+        after = [at(inside, c.path) for c in state]
+        state = [c._replace(is_truth=c.is_truth or is_condition(v)) for c, v in zip(state, after, strict=True)]
+        function, others = repeated(goes_on, state, after)
+        before = [0.0 if c.before is None else as_number(c.before) for c in state]
+        found = self.opaque(function, [*others, *before], len(state))
+        ends = [sympy.Eq(s, 1) if c.is_truth else s for c, s in zip(state, found, strict=True)]
+        placed([(c.path, v) for c, v in zip(state, ends, strict=True)], local)
 
     def _rounds(self, iterators: tuple, body: tuple, local: dict[str, Value], names: Names) -> None:
         (name, over), *rest = iterators

@@ -39,13 +39,14 @@ def load(source: str | Path, model: str | None = None, roots: Sequence[str | Pat
     - `MissingPackage` for Modelica source without rumoca.
     """
     is_text = isinstance(source, str) and ("\n" in source or not source.endswith((".bmo", ".mo")))
-    text = str(source) if is_text else Path(source).read_text(encoding="utf-8")
+    written = str(source) if is_text else Path(source).read_text(encoding="utf-8")
+    text = written.removeprefix("\ufeff")  # a byte order mark, which rumoca does not read
     is_base = text.startswith("//! base")
     is_modelica = not is_text and str(source).endswith(".mo") and not is_base
     if model is None and (is_base or not roots) and not is_modelica:
         flat = flat_of(read_base(text))
         return completed(flat, Sources(roots), DEFINED) if roots else flat
-    return _by_rumoca(text, None if is_text else Path(source), model, roots)
+    return _by_rumoca(text, None if is_text or text != written else Path(source), model, roots)
 
 
 def _by_rumoca(text: str, file: Path | None, model: str | None, roots: Sequence[str | Path]) -> FlatModel:

@@ -8,21 +8,20 @@ event are discrete variables; the others are expressions, put in wherever they a
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 import sympy
 
-from ..base.aliases import Condition
 from ..base.errors import ModelError
 from ..graph.expressions.from_sympy import symbols_of
 from ..write.component import Component
-from ..write.events import NO_FLAG, Assign, Sampled, terminate
+from ..write.discrete_equations import BEFORE, STARTED, DiscreteEquations
+from ..write.events import terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
 from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter
-from .kept_relations import KeptRelations
 from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
@@ -34,8 +33,6 @@ from .written_out import entries_of, unrolled
 REAL = "Real"
 _TEXTS = ("String", "StateSelect", "AssertionLevel")
 _CONSTANT = {"parameter", "constant"}
-# The values of `Scope.initial`: before the first iteration, in the first one, and from the second one on.
-STARTING, AT_FIRST, STARTED = 2, 1, 0
 
 
 class Scope:
@@ -46,14 +43,11 @@ class Scope:
     - `signals`: Boolean and Integer inputs that are real inputs of the component: true above 1/2, or rounded.
     - `interpreter`: evaluates expressions in these names.
     - `definitions`: which statement determines which variable.
-    - `kept`: relations whose truth is kept between events.
+    - `discrete`: the discrete equations; `kept`: relations whose truth is kept between events.
     - `names`: names of long expressions of functions.
-    - `initial`: the discrete variable that says how far the initial time is; None if nothing asks for it.
     - `carried_out`: what algorithms assign, by their numbers.
-    - `said`: the discrete variables of which initial equations say what they are; `initially`: what that is, where it
-      is not known beforehand. `waiting`: initial equations of discrete variables that wait for others, which they do
-      while `postpones` is true.
-    - `ticks`: the discrete variables that are 1 in the iteration in which a clock ticks, by the clock.
+    - `said`: the discrete variables of which initial equations say what they are. `waiting`: initial equations of
+      discrete variables that wait for others, which they do while `postpones` is true.
     - `as_numbers`: True while parameters are read as their values, which are final then.
     """
 
@@ -77,9 +71,10 @@ class Scope:
             flat.classes, self.value, special,
             LEFT_OUT | EXTERNALS | self.random.functions() | {ROOT: self._root}
             | {name: functools.partial(self._read_table, EXTERNALS[name]) for name in GET_VALUE},
-            self.entries, self._named,
+            self.entries, self._named, self._opaque,
         )  # fmt: skip
-        self.kept = KeptRelations(component, self.interpreter.quieted)
+        self.discrete = DiscreteEquations(component, self.interpreter.quieted)
+        self.kept = self.discrete.kept
         self.as_numbers = False
         self.final: dict[str, Value] = {}
         self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
@@ -90,13 +85,10 @@ class Scope:
         self.definitions = find_definitions(self.flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
         self.ends: set[sympy.Basic] = set()  # conditions that end the run
-        self.initial: DiscreteSymbol | None = None
         self.carried_out: dict[int, dict[str, Value]] = {}
         self.said: set[DiscreteSymbol] = set()
         self.waiting: list[tuple[Value, Value]] = []
         self.postpones = True
-        self.initially: dict[DiscreteSymbol, Value] = {}
-        self.ticks: dict[Sampled, DiscreteSymbol] = {}
 
     def _written_out(self, model: Class) -> Class:
         """The model with its arrays of variables and its loops of equations written out; sizes and ranges are known
@@ -309,13 +301,10 @@ class Scope:
         start = self._start(d.modifiers.get("start"))
         start = self._least(d.type) if start is None else as_number(start)
         self.component.discrete(d.name, start=start)
-        self.hidden(previous(DiscreteSymbol(d.name)).path, 0)
+        self.discrete.before(d.name)
+        if self.kind(d.type) == REAL:
+            self.discrete.reals.add(d.name)
         return self.stored(d.name)
-
-    def hidden(self, name: str, start: float) -> DiscreteSymbol:
-        """Declares a discrete variable that is not the text's."""
-        self.component.discrete(name, start=start)
-        return DiscreteSymbol(name)
 
     def _least(self, type_name: str) -> int:
         """What a discrete variable starts at if nothing says so: an enumeration at its first literal, others at 0."""
@@ -371,6 +360,18 @@ class Scope:
             self.component.add_equations(sympy.Eq(self.names[e], self.kept.in_equations(e), evaluate=False))
         return self.names[e]
 
+    def _opaque(self, function: Callable, arguments: Sequence[Value], count: int) -> Sequence[Value]:
+        """The results of a function of JAX, as variables; its arguments are variables, too."""
+        c = self.component
+        inputs: list[sympy.Symbol] = []
+        for value in arguments:
+            if not isinstance(value, VariableSymbol) or value.order:
+                symbol = c.variable(f":argument[{len(c.variables)}]")
+                c.add_equations(sympy.Eq(symbol, value, evaluate=False))
+                value = symbol
+            inputs.append(value)
+        return c.function(f":loop[{len(c.learned_terms)}]", function, inputs, count)
+
     def _root(self, *arguments: Value) -> Value:
         return root(self.component, self.interpreter.guards, *arguments)
 
@@ -405,22 +406,11 @@ class Scope:
         now = self.evaluate(e)
         return negated(plain(sympy.Eq(as_number(now), as_number(previous(now)))))
 
-    def phase(self, number: int) -> Condition:
-        """The condition that the initial time is so far: `STARTING`, `AT_FIRST` or `STARTED`."""
-        if self.initial is None:
-            self.initial = self.hidden(":initial", STARTING)
-        return sympy.Eq(self.initial, number)
-
     def _is_initial(self) -> Value:
-        return negated(self.phase(STARTED))
+        return negated(self.discrete.phase(STARTED))
 
     def _sample(self, start: Expression, interval: Expression) -> Value:
-        """True in the first iteration at a tick, but not at the initial time before it has settled."""
-        clock = self.component.sampled(self.evaluate(interval), self.evaluate(start))
-        if clock not in self.ticks:
-            tick = self.ticks[clock] = self.hidden(f":tick[{len(self.ticks)}]", 0)
-            self.component._event(clock, (Assign(tick, sympy.Integer(1)),), None, NO_FLAG)
-        return both(sympy.Eq(self.ticks[clock], 1), self.phase(STARTED))
+        return self.discrete.tick(self.component.sampled(self.evaluate(interval), self.evaluate(start)))
 
 
 def _is_of_parameters(value: sympy.Expr) -> bool:
@@ -467,7 +457,7 @@ def previous(value: Value) -> Value:
     if not isinstance(value, sympy.Basic):
         return value
     found = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
-    return value.xreplace({s: DiscreteSymbol(f":pre({n})") for s, n in found.items() if not n.startswith(":")})
+    return value.xreplace({s: DiscreteSymbol(f"{BEFORE}{n})") for s, n in found.items() if not n.startswith(":")})
 
 
 def present(value: Value) -> Value:
@@ -475,4 +465,6 @@ def present(value: Value) -> Value:
     if not isinstance(value, sympy.Basic):
         return value
     names = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
-    return value.xreplace({s: DiscreteSymbol(n[5:-1]) for s, n in names.items() if n.startswith(":pre(")})
+    return value.xreplace(
+        {s: DiscreteSymbol(n.removeprefix(BEFORE)[:-1]) for s, n in names.items() if n.startswith(BEFORE)}
+    )

@@ -77,7 +77,7 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
         if isinstance(a, DiscreteSymbol) and a not in scope.said:
             scope.said.add(a)
             if isinstance(b, sympy.Basic) and any(isinstance(s, VariableSymbol) for s in b.free_symbols):
-                scope.initially[a] = b
+                scope.discrete.initially[a] = b
             else:
                 c.parameters[a.path] = c.parameters[a.path].with_value(
                     _plain(b) if known else float(_numerical(scope, b))

@@ -11,6 +11,10 @@ from sympy.logic.boolalg import Boolean
 
 from ..base.errors import ModelError
 from ..write.automatic_events import smooth
+from ..write.truths import as_number as as_number
+from ..write.truths import both as both_hold
+from ..write.truths import either as one_holds
+from ..write.truths import plain as plain
 
 Value: TypeAlias = Any  # float | int | bool | str | sympy.Expr | Boolean | list | Record
 
@@ -25,15 +29,6 @@ class Results(list):
 
 def is_condition(value: Value) -> bool:
     return isinstance(value, bool | Boolean) and not isinstance(value, sympy.Symbol)
-
-
-def as_number(value: Value) -> Value:
-    """A truth as 1 or 0; other values as they are."""
-    if isinstance(value, bool):
-        return int(value)
-    if isinstance(value, Boolean) and not isinstance(value, sympy.Symbol):
-        return sympy.Piecewise((1, value), (0, True), evaluate=False)
-    return value
 
 
 def as_condition(value: Value) -> Value:
@@ -65,26 +60,11 @@ def negated(condition: Value) -> Value:
 
 
 def both(a: Value, b: Value) -> Value:
-    a, b = as_condition(a), as_condition(b)
-    if isinstance(a, bool):
-        return b if a else False
-    if isinstance(b, bool):
-        return a if b else False
-    return plain(sympy.And(a, b))
+    return both_hold(as_condition(a), as_condition(b))
 
 
 def either(a: Value, b: Value) -> Value:
-    a, b = as_condition(a), as_condition(b)
-    if isinstance(a, bool):
-        return True if a else b
-    if isinstance(b, bool):
-        return True if b else a
-    return plain(sympy.Or(a, b))
-
-
-def plain(value: Value) -> Value:
-    """SymPy's truths as Python's."""
-    return bool(value) if isinstance(value, sympy.logic.boolalg.BooleanAtom) else value
+    return one_holds(as_condition(a), as_condition(b))
 
 
 def chosen(condition: Value, a: Value, b: Value, quiet: bool = False) -> Value:

@@ -1,4 +1,4 @@
-"""The `when`s and the other discrete equations of a flat model, read into its `DiscreteMap`."""
+"""The `when`s and the other discrete equations of a flat model, read into its `DiscreteEquations`."""
 
 import collections
 from collections.abc import Iterator
@@ -10,38 +10,35 @@ from ..base.errors import ModelError
 from ..write.symbols import DiscreteSymbol, VariableSymbol
 from . import tree
 from .definitions import assigned_in, with_entries
-from .discrete_map import DiscreteMap
 from .scope import Scope, previous
 from .values import Value, as_condition, as_number, both, chosen, negated
 
 Target: TypeAlias = sympy.Symbol | str  # what an action writes; a text for `terminate`
 
 
-def read_followed(found: DiscreteMap, name: str) -> None:
+def read_followed(scope: Scope, name: str) -> None:
     """A discrete variable that has an equation outside of whens."""
-    scope = found.scope
     value = scope.defined(name, scope.definitions.of[name])
-    found.give(name, scope.kept.in_discrete(scope.kept.with_jumps_as_variables(value)), always=True)
+    scope.discrete.give(name, scope.kept.in_discrete(scope.kept.with_jumps_as_variables(value)), always=True)
 
 
-def read_when(found: DiscreteMap, s: tree.Branches) -> None:
+def read_when(scope: Scope, s: tree.Branches) -> None:
     """A `when` among equations: what its body assigns is what it was before where no branch acts."""
-    scope = found.scope
-    acting = found.branches([list(_conditions(scope, c, scope.value)) for c, _ in s.branches])
+    acting = scope.discrete.branches([list(_conditions(scope, c, scope.value)) for c, _ in s.branches])
     cases: dict[str, list[tuple[Value, Value]]] = {}
     for acts, (_, body) in zip(acting, s.branches, strict=True):
         for target, value in _each_action(scope, body):
             if isinstance(target, DiscreteSymbol):
                 cases.setdefault(target.path, []).append((acts, value))
             else:
-                _act(found, acts, target, value)
+                _act(scope, acts, target, value)
     for name, given in cases.items():
-        found.give(name, _first(given, previous(DiscreteSymbol(name))))
+        scope.discrete.give(name, _first(given, previous(DiscreteSymbol(name))))
 
 
-def read_section(found: DiscreteMap, section: tuple[tree.Statement, ...]) -> None:
+def read_section(scope: Scope, section: tuple[tree.Statement, ...]) -> None:
     """An algorithm with whens: its statements count one after another, so that the last assignment does."""
-    algorithm = _Algorithm(found, section)
+    algorithm = _Algorithm(scope, section)
     for s in section:
         if isinstance(s, tree.Branches) and s.kind == "when":
             algorithm.carry_out_when(s)
@@ -49,7 +46,7 @@ def read_section(found: DiscreteMap, section: tuple[tree.Statement, ...]) -> Non
             algorithm.carry_out(s)
             algorithm.keep_relations()
     for name in algorithm.kept:
-        found.give(name, algorithm.once.get(name, algorithm.local[name]), always=True)
+        scope.discrete.give(name, algorithm.once.get(name, algorithm.local[name]), always=True)
 
 
 class _Algorithm:
@@ -60,8 +57,8 @@ class _Algorithm:
     - `once`: the values of the latter.
     """
 
-    def __init__(self, found: DiscreteMap, section: tuple[tree.Statement, ...]):
-        self.found, self.scope = found, found.scope
+    def __init__(self, scope: Scope, section: tuple[tree.Statement, ...]):
+        self.scope = scope
         self.count = collections.Counter(n for s in _statements(section) for n in self._assigned(s))
         self.kept = [n for n in self.count if n in self.scope.definitions.stored]
         self.local: dict[str, Value] = {n: previous(self.scope.stored(n)) for n in self.kept}
@@ -83,7 +80,7 @@ class _Algorithm:
             values.update({n: self.scope.kept.in_discrete(values[n]) for n in self.kept if n in values})
 
     def carry_out_when(self, s: tree.Branches) -> None:
-        acting = self.found.branches([list(_conditions(self.scope, c, self.names)) for c, _ in s.branches])
+        acting = self.scope.discrete.branches([list(_conditions(self.scope, c, self.names)) for c, _ in s.branches])
         before, results = dict(self.local), []
         for acts, (_, body) in zip(acting, s.branches, strict=True):
             self.local = dict(before)
@@ -91,7 +88,7 @@ class _Algorithm:
                 self.carry_out(each)
                 if isinstance(each, tree.Effect):
                     for target, value in _each_action(self.scope, (each,)):
-                        _act(self.found, acts, target, value)
+                        _act(self.scope, acts, target, value)
             once = {n: self.once[n] for each in body for n in self._assigned(each) if n in self.once}
             results.append((acts, self.local | once))
         self.local = dict(before)
@@ -117,12 +114,12 @@ def _statements(section: tuple[tree.Statement, ...]) -> Iterator[tree.Statement]
             yield s
 
 
-def _act(found: DiscreteMap, acts: Value, target: Target, value: Value) -> None:
+def _act(scope: Scope, acts: Value, target: Target, value: Value) -> None:
     """What a branch does beside assigning."""
     if isinstance(target, str):
-        found.end(acts, target)
+        scope.discrete.end(acts, target)
     elif isinstance(target, VariableSymbol):
-        found.reinit(acts, target, value)
+        scope.discrete.reinit(acts, target, value)
     else:
         raise ModelError(f"reinit takes a state; got {target}")
 

@@ -67,6 +67,8 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         self.connections: list[Connection] = []
         self.signals: list[Signal] = []
         self.events: list[When] = []
+        self.discrete_equations: dict[DiscreteSymbol, sympy.Basic] = {}
+        self._solved = None  # the discrete equations, once they are written as events
         self.relations: list[float] = []
         self.as_written: dict[sympy.Expr, sympy.Expr] = {}
         self.held_branches: list[HeldBranch] = []
@@ -525,9 +527,9 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
 
 _BASE_ATTRIBUTES = (
     *"ev name parent parameters variables ports children equations".split(),
-    *"learned_terms connections signals events relations as_written held_branches accounts".split(),
-    *"tree_branches tree_roots".split(),
-    *"_line _lines _sealed".split(),
+    *"learned_terms connections signals events discrete_equations relations as_written held_branches".split(),
+    *"accounts tree_branches tree_roots".split(),
+    *"_line _lines _sealed _solved".split(),
 )
 
 

@@ -7,9 +7,9 @@ import sympy
 from ..base.aliases import Condition, Expression
 from ..base.errors import ModelError
 from .declarations import Parameter, Value, Variable
+from .discrete_declarations import DiscreteDeclarations
 from .equations import zero_of
 from .events import NO_FLAG, Assign, EventFlag, HeldBranch, Terminate, relation_in_discretes
-from .relation_declarations import RelationDeclarations
 from .symbols import DiscreteSymbol, RelationSymbol, der
 
 # Modes of `sliding` at an instant, beside 1, −1 and 0: the solution begins somewhere, may be on the surface and reads
@@ -18,7 +18,7 @@ _ON_IT, _ABOVE_IS_TRIED, _BELOW_IS_TRIED, _LEAVES_ABOVE = 3, -2, 2, 4
 HIGHEST = 2  # the most often that a branch may have to be differentiated: what holds positions back
 
 
-class ModeDeclarations(RelationDeclarations):
+class ModeDeclarations(DiscreteDeclarations):
     """The part of `Component` that concerns equations of which events choose one."""
 
     held_branches: list[HeldBranch]

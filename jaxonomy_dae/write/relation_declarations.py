@@ -87,8 +87,8 @@ class RelationDeclarations(EventDeclarations):
 
     def _with_events(self) -> None:
         """Turns the relations in all equations written so far into events."""
-        new, watched = with_events(tuple(self.equations), len(self.relations))
-        if not watched:
+        new, watched = with_events(tuple(map(self._as_kept, self.equations)), len(self.relations))
+        if not watched and all(n is e for n, e in zip(new, self.equations, strict=True)):
             return
         self.as_written = {n: e for n, e in zip(new, self.equations, strict=True) if n is not e}
         self.equations[:] = new
@@ -99,6 +99,10 @@ class RelationDeclarations(EventDeclarations):
                 self._turns(each)
             else:
                 self._steps(each)
+
+    def _as_kept(self, equation: sympy.Expr) -> sympy.Expr:
+        """An equation with those of its relations that discrete equations read as these read them."""
+        return equation
 
     def _turns(self, relation: Turning) -> None:
         """Events of a relation. At the initial time it is as its sides say, unless a clock ticks there."""

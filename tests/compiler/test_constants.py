@@ -67,7 +67,6 @@ def test_what_counts_as_explained():
 METHODS = {
     "solve/events/search": "where an interval is cut, and where the search in it ends",
     "fmi/calls": "what differences of an FMU move, and how near an event they are taken",
-    "modelica/discrete_map": "what the rounding of a delay leaves of a number that is evaluated twice",
     "run/start/gauss_newton": "the least gain",
     "run/start/guessed_point": "where the search begins and ends",
     "run/start/homotopy": "the shortest step along a curve",

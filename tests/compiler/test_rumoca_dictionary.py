@@ -140,3 +140,37 @@ def test_what_is_not_read_is_said(dae, told):
 def test_bad_sources(source, model, told):
     with pytest.raises(ModelError, match=told):
         load(source, model)
+
+
+FOREIGN = """package Plant
+  model Broken
+    Unknown.Part p;
+  end Broken;
+  model Late
+    Real x(start = 1.0, fixed = true);
+  equation
+    der(x) = -delay(x, 0.1);
+  end Late;
+  model Fine
+    Real x(start = 0.0, fixed = true);
+  equation
+    der(x) = 2.0;
+    when x >= 1.0 then
+      terminate("full");
+    end when;
+  end Fine;
+end Plant;
+"""
+
+
+def test_sources_from_elsewhere(tmp_path):
+    """A byte order mark; a package in one file, of which one class is broken, and one needs what is not read."""
+    marked, file = tmp_path / "Lag.mo", tmp_path / "Plant.mo"
+    marked.write_text("\ufeffmodel Lag\n  Real x;\nequation\n  x = time;\nend Lag;\n", encoding="utf-8")
+    file.write_text(FOREIGN, encoding="utf-8")
+    for path, model in ((marked, "Lag"), (file, "Plant.Fine")):
+        assert [d.name for d in load(path, model).model.declarations] == ["x"]
+    with pytest.raises(ModelError, match=r"line 3: the type reference 'Unknown\.Part' is not found"):
+        load(file, "Plant.Broken")
+    with pytest.raises(ModelError, match=r"line 8: delay\(…\) needs the past"):
+        FlatComponent(EqnEnv(), "m", load(file, "Plant.Late"))

@@ -167,3 +167,71 @@ def test_the_command_says_which_variable_it_does_not_know(tmp_path, capsys):
     file.write_text("model m\n Real x(start = 1, fixed = true); equation der(x) = -x; end m;")
     assert main([str(file), "y"]) == 1
     assert "'m.y'" in capsys.readouterr().err
+
+
+NEWTON = """package 'M'
+  function 'root' "by Newton's method, as media functions invert their formulas"
+    input Real 'a';
+    output Real 'y';
+  protected
+    Boolean 'found';
+    Integer 'i';
+    Real 'd';
+  algorithm
+    'y' := 'a';
+    'i' := 0;
+    'found' := false;
+    while 'i' < 50 and not 'found' loop
+      'd' := ('y' * 'y' - 'a') / (2 * 'y');
+      'y' := 'y' - 'd';
+      'i' := 'i' + 1;
+      if abs('d') < 1e-13 then
+        'found' := true;
+      end if;
+    end while;
+  end 'root';
+  model 'M'
+    parameter Real 'k' = 1.0;
+    Real 'x'(start = 1.0, fixed = true);
+  equation
+    der('x') = 'k' * 'root'('x');
+  end 'M';
+end 'M';
+"""
+
+
+@pytest.mark.slow
+def test_a_while_on_variables_and_its_derivative():
+    """x' = k √x: x = (1 + k t/2)²."""
+    system = compiled(NEWTON)
+
+    def end(k):
+        return simulate(system.with_parameters({"m.k": k}), 1.0, ts=jnp.array([1.0]), rtol=1e-10, atol=1e-12)["m.x"][0]
+
+    value, slope = jax.value_and_grad(end)(1.0)
+    assert value == pytest.approx(2.25, abs=1e-9)
+    assert slope == pytest.approx(1.5, abs=1e-8)
+    assert jax.jvp(end, (1.0,), (1.0,))[1] == pytest.approx(1.5, abs=1e-8)
+
+
+@pytest.mark.slow
+def test_a_violated_assertion_ends_the_run():
+    system = compiled(
+        """model 'M'
+  parameter Real 'least' = 0.5;
+  Real 'x'(start = 1.0, fixed = true);
+equation
+  der('x') = -1.0;
+  assert('x' > 'least', "the level is too low", AssertionLevel.error);
+  assert('x' > 0.9, "this one is a warning", AssertionLevel.warning);
+end 'M';
+"""
+    )
+
+    def when(least):
+        return simulate(system.with_parameters({"m.least": least}), 2.0, ts=jnp.array([0.0, 0.25]))
+
+    run = when(0.5)
+    assert run.events.terminated == "an assertion is violated: the level is too low"
+    assert float(run.events.ts[0]) == pytest.approx(0.5, abs=1e-9)
+    assert jax.grad(lambda least: when(least).events.ts[0])(0.5) == pytest.approx(-1.0, abs=1e-9)

@@ -12,7 +12,7 @@ from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, ModelError, St
 from jaxonomy_dae.modelica import FlatComponent, load
 
 TEXTS = {c["name"]: c for c in json.loads((Path(__file__).parents[1] / "data" / "modelica_texts.json").read_text())}
-QUICK = {"arrays_loops"}  # the others wait for slow tests
+QUICK = {"arrays_loops", "while_on_variables"}  # the others wait for slow tests
 
 
 def compiled(case):

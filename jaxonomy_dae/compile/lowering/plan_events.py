@@ -35,7 +35,8 @@ class EventPlan:
     state: np.ndarray  # where in the state array an action writes, or −1
     factor: np.ndarray  # of the variable that it writes, in units of the state
     discrete: np.ndarray  # the parameters that are discrete variables, hidden ones last
-    n_visible: int  # how many of them were declared
+    n_declared: int  # how many of them were declared; the others are relations
+    n_visible: int  # how many of these are shown
     dependents: tuple[Formulas, ...]  # the parameters that follow them
     facts: EventFacts
 
@@ -111,7 +112,8 @@ def plan_events(
         state=place,
         factor=factor,
         discrete=flat.parameters.discrete,
-        n_visible=len(flat.parameters.discrete) - flat.parameters.n_relations,
+        n_declared=len(flat.parameters.discrete) - flat.parameters.n_relations,
+        n_visible=flat.parameters.n_shown,
         dependents=flat.parameters.follow_events,
         facts=EventFacts(
             flags=tuple(event.flags for event in table.events),

@@ -83,7 +83,8 @@ class ParameterTable:
     bounds: list[Interval]
     dependents: tuple[Formulas, ...]  # each reads only what those before it have computed
     expressions: dict[int, str]  # of the dependent ones, in full names
-    discrete: np.ndarray  # those that events assign, hidden ones last, such as relations that are events
+    discrete: np.ndarray  # those that events assign, relations that are events last
+    n_shown: int  # the first so many of them are not hidden
     relation_starts: np.ndarray  # of the hidden ones, which follow what was declared
 
     def __len__(self):

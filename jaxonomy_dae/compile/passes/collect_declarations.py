@@ -150,6 +150,7 @@ def parameter_table(model: ModelNumbers) -> tuple[ParameterTable, np.ndarray]:
         dependents,
         expressions,
         model.discrete,
+        model.n_shown,
         starts,
     )
     return table, table.everything(array)

@@ -65,17 +65,24 @@ class ModelNumbers:
         self._number(self._counted())
         self.of: dict[int, Instances] = {id(i.component): i for i in self.instances}
         self.paths = Paths(self._paths())
-        # After all parameters follow the hidden discrete variables, then what discrete variables were before an event,
-        # in the order of these.
-        flagged = [np.zeros(0, np.int64)]
-        for i in self.instances:
-            places = [k for k, p in enumerate(i.component.parameters.values()) if p.is_discrete]
-            if places:
-                flagged.append((i.parameter[:, None] + np.array(places)).ravel())
+        # After all parameters follow the relations that are events, then what discrete variables were before an event,
+        # in the order of these. Declared ones come first, those that are not shown after the others.
+        shown, unshown = self._declared_discretes(False), self._declared_discretes(True)
+        self.n_shown = len(shown)
         self.relations = self.n_parameters + np.arange(self.n_relations)
-        self.discrete = np.concatenate([np.sort(np.concatenate(flagged)), self.relations])
+        self.discrete = np.concatenate([shown, unshown, self.relations])
         self.previous = np.full(self.n_parameters + self.n_relations, -1, np.int64)
         self.previous[self.discrete] = len(self.previous) + np.arange(len(self.discrete))
+
+    def _declared_discretes(self, unshown: bool) -> np.ndarray:
+        """The discrete variables that components have declared, those whose names begin with a colon or the others."""
+        found = [np.zeros(0, np.int64)]
+        for i in self.instances:
+            declared = i.component.parameters.items()
+            places = [k for k, (n, p) in enumerate(declared) if p.is_discrete and n.startswith(":") == unshown]
+            if places:
+                found.append((i.parameter[:, None] + np.array(places)).ravel())
+        return np.sort(np.concatenate(found))
 
     def _counted(self) -> dict[int, np.ndarray]:
         """For each component object, by id, the numbers (as of `_own`) of everything that one instance of it is and has

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from ...base.aliases import Args, Numeric, PyTree, Times
 from ...base.errors import ModelError
 from ...host.staging import is_traced, on_device
+from ...solve.events.iteration import Iteration
 from ...solve.events.problem import HybridState
 from ..system.system import AcausalSystem
 
@@ -20,7 +21,8 @@ SHOWN = 12  # events in the text of a log
 
 
 class EventLog(eqx.Module):
-    """The events of a run, one row each, up to the log's capacity; `count` counts those beyond it, too."""
+    """The events of a run, one row each, up to the log's capacity; `count` counts those beyond it, too. `iteration` is
+    how far repeated events were at the last instant."""
 
     ts: Float[Array, "*batch events"]
     which: Float[Array, "*batch events"]
@@ -29,6 +31,7 @@ class EventLog(eqx.Module):
     stuck: Float[Array, "*batch"]
     before: Float[Array, "*batch rows m"]
     after: Float[Array, "*batch rows m"]
+    iteration: Iteration | None = None
 
     @classmethod
     def empty(cls, batch: tuple[int, ...], m: int, dtype: DTypeLike) -> "EventLog":
@@ -42,7 +45,7 @@ class EventLog(eqx.Module):
         table: Any = state.table
         ts, which, rate = (table.log[:, k] for k in range(3))
         frozen = jax.lax.stop_gradient((which, jnp.abs(rate), state.count, state.stuck))
-        return cls(ts, *frozen, table.sides[:, 0], table.sides[:, 1])
+        return cls(ts, *frozen, table.sides[:, 0], table.sides[:, 1], jax.lax.stop_gradient(state.iteration))
 
 
 class Events:

@@ -45,10 +45,8 @@ REST = (
     "Say how the model rests: a mode in which it stays (complementary(…, rest_speed=…), contacts.HardStop; a discrete "
     "variable that the event assigns and the equations read), or when(…, terminate(…)) before"
 )
-OKAY: tuple[Result, Result] = (
-    diffrax.RESULTS.successful,
-    diffrax.RESULTS.event_occurred,
-)  # what `diffrax.is_okay` accepts
+# What `diffrax.is_okay` accepts.
+OKAY: tuple[Result, Result] = (diffrax.RESULTS.successful, diffrax.RESULTS.event_occurred)
 PROBES = 64  # times at which inputs are looked at
 
 
@@ -224,7 +222,7 @@ def _not_finite(system: AcausalSystem, x: State) -> tuple[str, str]:
     events = system.plan.events
     if events is None:
         return "", ""
-    names = system.discretes
+    names = system.every_discrete
     n = len(system.states)
     resets = np.isin(np.arange(n), events.state)
     pairs = [*zip(names, np.asarray(system.discrete_values)[: len(names)], [True] * len(names), strict=True)]
@@ -272,6 +270,10 @@ def _stuck(solution: Solution, event: int, at: Stopped) -> str:
     if EventFlag.RELATION in table.table.events[event].flags:
         together = turning_in_turn(system, event, (at.t, at.y), abs(float(at.t1 - at.t0)), inputs)
         return _in_turn([table.table.events[k] for k in together], t) or _sliding(table.table.events[event], t)
+    if EventFlag.REPEATED in table.table.events[event].flags:
+        unsettled = _unsettled(solution, t)
+        if unsettled:
+            return unsettled
     times, which = np.asarray(solution.events.ts), np.asarray(solution.events.which, int)
     # Where events accumulate, the last ones follow each other as rounding has it.
     lately = times > t - instant
@@ -309,6 +311,29 @@ def _stuck(solution: Solution, event: int, at: Stopped) -> str:
     )
 
 
+def _unsettled(solution: Solution, t: float) -> str:
+    """Says which discrete variables go round in a circle at t, or change in every iteration; "" if none does."""
+    log, system = solution.event_log, solution.system
+    if log is None or log.iteration is None:
+        return ""
+    count, names = int(log.iteration.count), system.discretes
+    changed = [name for name, turns in zip(names, np.asarray(log.iteration.turning), strict=False) if turns > 0]
+    text = f"the integration stopped at t={t:.6g}: the discrete equations have no values that stay there"
+    if count < 0:
+        which = f"{listed(changed)} go" if len(changed) > 1 else f"{listed(changed)} goes" if changed else "they go"
+        return (
+            f"{text}: {which} round in a circle, and after {-count} iterations all values are those of an iteration "
+            "before. What one asks of another through its value before, pre(…), must end: let the conditions for "
+            "turning on and off lie apart, or put a delay between them (a clock)"
+        )
+    if changed and count > 2:
+        return (
+            f"{text}: {listed(changed)} {'change' if len(changed) > 1 else 'changes'} in each of {count} iterations. "
+            "Let a condition end that"
+        )
+    return ""
+
+
 def _clash(solution: Solution, number: int, t: float) -> str:
     """Says which two events contradict each other at t, and in what."""
     system = solution.system
@@ -316,8 +341,8 @@ def _clash(solution: Solution, number: int, t: float) -> str:
     pair = pair_of(number, len(plan) + 1)
     places = [{place for event, place in plan.facts.contested if event == k} for k in pair]
     events = sorted(plan.names[k] for k in pair)
-    names = [*system.states, *system.carried, *system.discretes]
-    hidden = len(plan.discrete) - plan.n_visible
+    names = [*system.states, *system.carried, *system.every_discrete]
+    hidden = len(plan.discrete) - plan.n_declared
     shared = [names[place + hidden if place < 0 else place] for place in sorted(places[0] & places[1])]
     return (
         f"the integration stopped at t={t:.6g}: {listed(events)} happen at one instant and give {listed(shared)} "
@@ -335,6 +360,7 @@ def _accumulation(times: np.ndarray) -> str:
     ratios = apart[1:] / apart[:-1]
     if ratios.max() >= SHRINKING:
         return ""
+    # The times that are left are a geometric series.
     end = times[-1] + apart[-1] * ratios[-1] / (1 - ratios[-1])
     return f"the times between them shrink, each to {ratios[-1]:.3g} of the one before, and accumulate at t={end:.6g}"
 

@@ -218,9 +218,8 @@ class SystemReport(Sections):
 
 
 def _declared(flat: FlatModel) -> list[int]:
-    """The parameters that are discrete variables, relations left out."""
-    table = flat.parameters
-    return table.discrete[: len(table.discrete) - table.n_relations].tolist()
+    """The parameters that are discrete variables, hidden ones left out."""
+    return flat.parameters.discrete[: flat.parameters.n_shown].tolist()
 
 
 def _listed(table: EventTable) -> list[int]:

@@ -87,6 +87,7 @@ class AcausalSystem(eqx.Module):
     @property
     def report(self):
         """The report of the compiler, to be printed."""
+        # Imported where it is needed: reports, starts and exports read systems, and import this module themselves.
         from .report import SystemReport
 
         return SystemReport(self.plan, self.parameters.known)
@@ -287,14 +288,14 @@ class AcausalSystem(eqx.Module):
             shown = picked(array, (..., table.discrete[: len(table.discrete) - table.n_relations]))
             return joined([array, hidden, shown, hidden])
         values = self.discrete_values
-        return joined([array, picked(values, (..., slice(events.n_visible, None))), values])
+        return joined([array, picked(values, (..., slice(events.n_declared, None))), values])
 
     def holding(self, values: Any) -> "AcausalSystem":
         """The system with these values of its discrete variables, followed by the hidden ones."""
         events = self.plan.events
         if events is None or not len(events.discrete):
             return self
-        n, chosen = events.n_visible, events.discrete[: events.n_visible]
+        n, chosen = events.n_declared, events.discrete[: events.n_declared]
         array = self.parameters.array
         if n:
             array = complete(events.dependents, array.at[chosen].set(values[:n]))
@@ -316,16 +317,22 @@ class AcausalSystem(eqx.Module):
         if events is None:
             return jnp.zeros((0,))
         array = self.parameters.array
-        visible = picked(array, (..., events.discrete[: events.n_visible]))
-        starts = np.asarray(self.plan.flat.parameters.starts_of(events.discrete[events.n_visible :]), array.dtype)
-        hidden = np.broadcast_to(starts, (*visible.shape[:-1], len(starts)))
-        return joined([visible, hidden if self.modes is None else self.modes])
+        declared = picked(array, (..., events.discrete[: events.n_declared]))
+        starts = np.asarray(self.plan.flat.parameters.starts_of(events.discrete[events.n_declared :]), array.dtype)
+        hidden = np.broadcast_to(starts, (*declared.shape[:-1], len(starts)))
+        return joined([declared, hidden if self.modes is None else self.modes])
 
     @property
     def discretes(self) -> list[str]:
         """The names of the discrete variables."""
+        return self.every_discrete[: 0 if self.plan.events is None else self.plan.events.n_visible]
+
+    @property
+    def every_discrete(self) -> list[str]:
+        """The names of the declared discrete variables, followed by those that the package has added to a component,
+        such as what a variable of a Modelica model was in the iteration before."""
         events = self.plan.events
-        return [] if events is None else [self.parameters.names[p] for p in events.discrete[: events.n_visible]]
+        return [] if events is None else [self.parameters.names[p] for p in events.discrete[: events.n_declared]]
 
     def vector_field(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""
@@ -568,6 +575,9 @@ class AcausalSystem(eqx.Module):
         *,
         outputs: Sequence[str] | None = None,
         parameters: Sequence[str] | str = "all",
+        fmi: int = 3,
+        arrays: bool = False,
+        dae: bool = False,
         kinds: Sequence[str] | None = None,
         platforms: Sequence[str] | str | None = None,
         stop_time: float = 1.0,
@@ -579,8 +589,8 @@ class AcausalSystem(eqx.Module):
         from ...fmi.export import export_fmu
 
         return export_fmu(
-            self, path, outputs=outputs, parameters=parameters, kinds=kinds, platforms=platforms,
-            stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
+            self, path, outputs=outputs, parameters=parameters, fmi=fmi, arrays=arrays, dae=dae, kinds=kinds,
+            platforms=platforms, stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
         )  # fmt: skip
 
     def to_c(
@@ -600,6 +610,13 @@ class AcausalSystem(eqx.Module):
             self, path, outputs=outputs, functions=functions, stop_time=stop_time, tolerance=tolerance,
             overwrite=overwrite,
         )  # fmt: skip
+
+    def to_casadi(self, *, outputs: Sequence[str] | None = None) -> Any:
+        """This system as a `casadi.Function` of time, states, algebraic unknowns, discrete values, parameters and
+        inputs: see `jaxonomy_dae.fmi.to_casadi`, which has the same argument."""
+        from ...fmi.to_casadi import to_casadi
+
+        return to_casadi(self, outputs=outputs)
 
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
         if isinstance(solve_for, str):

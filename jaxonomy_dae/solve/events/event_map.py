@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array, lax
 
 from ...base.aliases import Args, Time
+from ...base.tolerances import CONSISTENT
 from ...write.events import EventFlag
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
@@ -32,7 +33,7 @@ from .side import BELOW, RESTS, rounding
 
 CONDITIONS_AT_ONE_INSTANT = 32  # if more events are due, the rest happen in another step, which is as good as none
 # How often guards may fall while time does not go on, beside so often for each. Beyond, relations turn back and forth,
-# or conditions make each other true without end.
+# or conditions make each other true without end. An iteration of repeated events counts as one, however many there are.
 SLIDES, TURNS = 64, 4
 
 
@@ -101,7 +102,8 @@ def _with_jumps(
 
 class _Events(NamedTuple):
     """What the events of one instant share: the time, at which the step ends; what is due; `first`, the events that
-    were listed before; and what events are, by their numbers."""
+    were listed before; `turns`, those that there were while time did not go on; and what events are, by their
+    numbers."""
 
     problem: AbstractHybridProblem
     t: Time
@@ -109,6 +111,7 @@ class _Events(NamedTuple):
     args: Args
     at_start: bool
     first: Array
+    turns: Array
     rivals: Rivals
     listed: np.ndarray
     ends: Array
@@ -128,7 +131,8 @@ class _Events(NamedTuple):
         waits = (arrival.size == 0) & (arrival.rate < 0) & ~arrival.due[c:] if at_start else np.zeros(g, bool)
         return _Events(
             problem=problem, t=t, arrival=arrival, args=args, at_start=at_start, first=state.count,
-            rivals=Rivals.of(facts), listed=facts.are(EventFlag.LISTED) & (np.arange(c + g) >= c) & (not at_start),
+            turns=state.turns, rivals=Rivals.of(facts),
+            listed=facts.are(EventFlag.LISTED) & (np.arange(c + g) >= c) & (not at_start),
             ends=jnp.asarray(facts.ends).astype(t.dtype), relations=jnp.asarray(facts.are(EventFlag.RELATION)),
             strikes=jnp.asarray(facts.are(EventFlag.STRIKE)), last=facts.are(EventFlag.LAST), waits=waits,
         )  # fmt: skip
@@ -174,7 +178,16 @@ class _Events(NamedTuple):
         # Ticks are counted, and times follow from the count: a sum of periods would drift by a rounding at each tick.
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         turns = state.turns + (~now.is_clock).astype(t.dtype)
-        again = self._again(now, after.stuck, turns)
+        iteration = state.iteration
+        circles = jnp.array(False)
+        if iteration is not None:
+            ends = jnp.asarray(self.last)[event]  # an iteration; relations may turn anew in the next one
+            turns = jnp.where(ends, self.turns + 1, turns)
+            moved = jnp.any(jnp.abs(x - reached) > CONSISTENT * (jnp.abs(x) + jnp.abs(reached)))
+            one_more = iteration.after(after.q, lax.stop_gradient(moved))
+            iteration = jax.tree.map(lambda a, b: jnp.where(ends, a, b), one_more, iteration)
+            circles = iteration.count < 0
+        again = jnp.where(circles, event, self._again(now, after.stuck, turns))
         wrote = instant.wrote
         if rivals.places:
             both = jnp.concatenate([reached, q]), jnp.concatenate([x, written])
@@ -196,6 +209,7 @@ class _Events(NamedTuple):
                 ended=jnp.maximum(state.ended, jnp.max(jnp.where(now.these, self.ends, 0.0))),
                 stuck=again.astype(t.dtype),
                 turns=turns,
+                iteration=iteration,
             ),
             left=after.left,
             caused=after.caused,

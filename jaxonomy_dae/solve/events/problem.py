@@ -16,6 +16,7 @@ from ...base.private_names import rewrapped, unwrapped
 from ..adjoint.appended import AbstractAppending
 from .facts import EventFacts
 from .first_order import constant_once
+from .iteration import Iteration
 from .log import EventRows
 
 
@@ -108,6 +109,7 @@ class HybridState(AbstractAppending):
         instant, below −1 for two that contradict each other (`rivals.pair_of`), else −1; `turns`: how often guards have
         fallen without time going on.
     - `count`: how many events there were; `table`: the first ones, or None where `StoredAdjoint` keeps them elsewhere.
+    - `iteration`: how far repeated events are at this instant; None without such.
     """
 
     x: Float[Array, " n"]
@@ -116,16 +118,19 @@ class HybridState(AbstractAppending):
     of_clocks: Float[Array, "2 clocks"]
     of_run: Float[Array, "6"]
     table: EventRows | None
+    iteration: Iteration | None = None
 
     @classmethod
-    def of(cls, x: State, q: Array, table: EventRows | None, **parts: Array) -> "HybridState":
+    def of(
+        cls, x: State, q: Array, table: EventRows | None, iteration: Iteration | None = None, **parts: Array
+    ) -> "HybridState":
         """A state of all its parts."""
         packed = {field: jnp.stack([parts[name] for name in names]) for field, names in _PARTS.items()}
-        return cls(x=x, q=q, table=table, **packed)
+        return cls(x=x, q=q, table=table, iteration=iteration, **packed)
 
-    def but(self, **changes: Array) -> "HybridState":
+    def but(self, **changes: Any) -> "HybridState":
         """A copy with the named parts replaced."""
-        whole = {name: changes.pop(name) for name in ("x", "q") if name in changes}
+        whole = {name: changes.pop(name) for name in ("x", "q", "iteration") if name in changes}
         for field, names in _PARTS.items():
             if not changes.keys().isdisjoint(names):
                 parts = zip(names, getattr(self, field), strict=True)

@@ -111,8 +111,12 @@ class WithEvents(WrappedSolver):
         )
         dense = _DenseOutput(solver.interpolation_cls, info)
         request, armed, values, arrival = looked_at(problem, dense, t0, t1, y0, x1, args)
-        turns = jnp.where(t1 - t0 > MOVED * problem.resolution, jnp.zeros_like(y0.turns), y0.turns)
-        state = y0.but(x=x1, armed=armed, size=arrival.size, span=arrival.span, request=request, turns=turns)
+        goes_on = t1 - t0 > MOVED * problem.resolution
+        turns = jnp.where(goes_on, jnp.zeros_like(y0.turns), y0.turns)
+        iteration = None if y0.iteration is None else y0.iteration.anew(goes_on)
+        state = y0.but(
+            x=x1, armed=armed, size=arrival.size, span=arrival.span, request=request, turns=turns, iteration=iteration
+        )
         fired = jnp.any(arrival.due)
 
         noted = EventRows.empty(

@@ -12,6 +12,7 @@ from ...write.events import EventFlag
 from ..adjoint.resting import still
 from .event_map import handle
 from .instant import Arrival
+from .iteration import Iteration
 from .log import EventRows
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS, rounding
@@ -64,10 +65,12 @@ def start(
         armed = jnp.where(value > band, ABOVE, jnp.where(value < -far, BELOW, resumed.sides))
         at_once = ~relations[c:]
     table = EventRows.empty(logged, sides, len(x0) + len(q0), dtype)
+    repeated = problem.facts.are(EventFlag.REPEATED).any()
+    iteration = Iteration.begin(len(q0), dtype) if repeated else None
     state = HybridState.of(
-        x0, q0, table, armed=armed.astype(dtype), size=size, ticks=ticks, due=lax.stop_gradient(problem.due(ticks)),
-        span=nothing, request=jnp.full_like(t0, jnp.inf), ended=nothing, stuck=nothing - 1.0, turns=nothing,
-        count=nothing,
+        x0, q0, table, iteration, armed=armed.astype(dtype), size=size, ticks=ticks,
+        due=lax.stop_gradient(problem.due(ticks)), span=nothing, request=jnp.full_like(t0, jnp.inf), ended=nothing,
+        stuck=nothing - 1.0, turns=nothing, count=nothing,
     )  # fmt: skip
     if relations[:c].all() and not at_once.any():
         return state

@@ -5,37 +5,45 @@ rests at the level, and continuous equations see the one that the modes see.
 """
 
 from collections.abc import Collection
+from typing import Protocol
 
 import sympy
 
 from ..base.aliases import Condition, Expression
 from ..graph.expressions.from_sympy import symbols_of
 from ..graph.expressions.smooth import Smooth
-from ..write.automatic_events import ROUNDING, varies
-from ..write.component import Component
-from ..write.symbols import DiscreteSymbol, VariableSymbol
-from .values import Value, plain
+from .automatic_events import ROUNDING, varies
+from .symbols import DiscreteSymbol, VariableSymbol
+from .truths import Truth, plain
 
 _ORDER = (sympy.StrictGreaterThan, sympy.GreaterThan, sympy.StrictLessThan, sympy.LessThan)
 _JUMPING = (*ROUNDING, sympy.sign, sympy.Heaviside)
 
 
+class Following(Protocol):
+    """What a component does for relations whose truth is kept."""
+
+    def _followed(self, condition: Condition) -> tuple[Condition, Condition]: ...
+
+    def _as_variable(self, side: Expression) -> VariableSymbol: ...
+
+
 class KeptRelations:
     """The relations of a component whose truth is kept; those of `quiet` are not."""
 
-    def __init__(self, component: Component, quiet: Collection[Condition]):
+    def __init__(self, component: Following, quiet: Collection[Condition]):
         self.component, self.quiet = component, quiet
         self.forms: dict[Condition, Condition] = {}
         self.variables: dict[Expression, Expression] = {}
 
-    def in_discrete(self, value: Value) -> Value:
+    def in_discrete(self, value: Truth) -> Truth:
         """A value of discrete equations with all its relations replaced by their kept truths."""
         if not isinstance(value, sympy.Basic):
             return value
         found = {r: self._form(r) for r in _outermost(value, _ORDER) if varies(r) and r not in self.quiet}
         return plain(value.xreplace(found)) if found else value
 
-    def in_bodies(self, value: Value) -> Value:
+    def in_bodies(self, value: Truth) -> Truth:
         """A value in the body of a `when` with those of its relations replaced that others read, or that turn at times
         known beforehand: the rest is looked at where the body holds only."""
         if not isinstance(value, sympy.Basic):
@@ -50,7 +58,7 @@ class KeptRelations:
         found = {r: self._form(r) for r in expression.atoms(*_ORDER) if self._known(r)}
         return expression.xreplace(found) if found else expression
 
-    def with_jumps_as_variables(self, value: Value) -> Value:
+    def with_jumps_as_variables(self, value: Truth) -> Truth:
         """A value with whole parts of what changes in time as variables, whose equations have events as others have."""
         if not isinstance(value, sympy.Basic):
             return value

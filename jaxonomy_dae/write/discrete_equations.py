@@ -1,4 +1,4 @@
-"""The discrete equations of a flat model as one map, which events repeat at an instant until nothing changes.
+"""The discrete equations of a component as one map, which events repeat at an instant until nothing changes.
 
 Given are m = F(m, pre(m), y), an equation for each discrete variable m that is kept, in the present values of all
 others and in continuous variables y, which follow m by the other equations. At an instant
@@ -16,21 +16,37 @@ not in the iteration before, and pre(m) otherwise (sections 8.3.5 and 11.2.7).
 
 import functools
 import graphlib
-from typing import Any, NamedTuple
+from collections.abc import Collection
+from typing import Any, NamedTuple, Protocol
 
 import sympy
 
 from ..base.aliases import Condition, Expression
 from ..base.errors import ModelError
 from ..graph.expressions.to_sympy import shortened
-from ..write.events import Assign, EventFlag, Reinit, Terminate, pre
-from ..write.symbols import DiscreteSymbol, VariableSymbol
-from .scope import AT_FIRST, REAL, STARTED, STARTING, Scope, previous
-from .values import Value, as_number, both, chosen, either, negated, plain
+from .events import NO_FLAG, Action, Assign, EventFlag, Reinit, Sampled, Terminate, pre
+from .kept_relations import Following, KeptRelations
+from .symbols import DiscreteSymbol, VariableSymbol
+from .truths import Truth, as_number, both, either, negated, plain
 
 # What two evaluations of one number at one instant may differ by, in parts of it: states are followed over a delay
 # that is rounding between them.
 SAME = sympy.Float(1e-10)
+# How far the initial time is: before the first iteration, in the first one, and from the second one on.
+STARTING, AT_FIRST, STARTED = 2, 1, 0
+BEFORE = ":pre("  # begins the name of the variable that has another one's value in the iteration before
+
+
+class Declaring(Following, Protocol):
+    """What a component does for its discrete equations."""
+
+    def _unshown(self, name: str, start: float) -> DiscreteSymbol: ...
+
+    def _event(
+        self, condition: Any, actions: tuple[Action, ...], on: Any, flags: EventFlag, text: str | None = None
+    ) -> None: ...
+
+    def _hidden(self, name: str, expression: sympy.Expr) -> str: ...
 
 
 class Branch(NamedTuple):
@@ -41,26 +57,64 @@ class Branch(NamedTuple):
     text: str
 
 
-class DiscreteMap:
+class DiscreteEquations:
     """The discrete equations of a component, gathered one by one and written at the end.
 
-    - `values`: the new value of each variable that is kept, in present values.
-    - `always`: those whose value may change without a `when`.
+    - `kept`: relations whose truth is kept between events; those of `quiet` are not.
+    - `values`: the new value of each variable that is kept, in present values; `always`: those whose value may change
+      without a `when`; `reals`: those that are compared within rounding.
+    - `remembered`: variables of which equations read what they were before, and which other events assign.
+    - `initial`: the discrete variable that says how far the initial time is; None if nothing asks for it.
+    - `initially`: what variables are in the first iteration, where it is not known beforehand.
+    - `ticks`: the discrete variables that are 1 in the iteration in which a clock ticks, by the clock.
     """
 
-    def __init__(self, scope: Scope):
-        self.scope = scope
-        self.values: dict[str, Value] = {}
+    def __init__(self, component: Declaring, quiet: Collection[Condition] = ()):
+        self.component, self.kept = component, KeptRelations(component, quiet)
+        self.values: dict[str, Truth] = {}
         self.always: set[str] = set()
+        self.reals: set[str] = set()
+        self.remembered: list[DiscreteSymbol] = []
+        self.initial: DiscreteSymbol | None = None
+        self.initially: dict[DiscreteSymbol, Truth] = {}
+        self.ticks: dict[Sampled, DiscreteSymbol] = {}
+        self._before: set[str] = set()
         self._hidden: dict[VariableSymbol, Expression] = {}
         self._conditions: list[tuple[VariableSymbol, DiscreteSymbol]] = []
         self._branches: list[Branch] = []
-        self._reinits: dict[VariableSymbol, list[tuple[Condition, Value]]] = {}
+        self._reinits: dict[VariableSymbol, list[tuple[Condition, Truth]]] = {}
         self._ends: list[tuple[Condition, str]] = []
+
+    # --- what equations read -----------------------------------------------------------------------------------------
+
+    def before(self, name: str) -> DiscreteSymbol:
+        """A discrete variable in the iteration before."""
+        found = f"{BEFORE}{name})"
+        if found not in self._before:
+            self._before.add(found)
+            self.unshown(found, 0.0)
+        return DiscreteSymbol(found)
+
+    def unshown(self, name: str, start: float) -> DiscreteSymbol:
+        """Declares a discrete variable that is not shown."""
+        return self.component._unshown(name, start)
+
+    def phase(self, number: int) -> Condition:
+        """The condition that the initial time is so far: `STARTING`, `AT_FIRST` or `STARTED`."""
+        if self.initial is None:
+            self.initial = self.unshown(":initial", STARTING)
+        return sympy.Eq(self.initial, number)
+
+    def tick(self, clock: Sampled) -> Truth:
+        """True in the first iteration at a tick, but not at the initial time before it has settled."""
+        if clock not in self.ticks:
+            tick = self.ticks[clock] = self.unshown(f":tick[{len(self.ticks)}]", 0.0)
+            self.component._event(clock, (Assign(tick, sympy.Integer(1)),), None, NO_FLAG)
+        return both(sympy.Eq(self.ticks[clock], 1), self.phase(STARTED))
 
     # --- what is gathered --------------------------------------------------------------------------------------------
 
-    def give(self, name: str, value: Value, always: bool = False) -> None:
+    def give(self, name: str, value: Truth, always: bool = False) -> None:
         """Says what a variable becomes."""
         if name in self.values:
             raise ModelError(
@@ -70,22 +124,22 @@ class DiscreteMap:
         if always:
             self.always.add(name)
 
-    def branches(self, conditions: list[list[tuple[Value, bool]]]) -> list[Condition]:
+    def branches(self, conditions: list[list[tuple[Truth, bool]]]) -> list[Condition]:
         """When each branch of a `when` acts: one of its conditions becomes true, and those of no branch before do. A
         condition is a pair (truth, whether it counts at the initial time, too)."""
         out: list[Condition] = []
-        before: Value = False
+        before: Truth = False
         for entries in conditions:
             rises = functools.reduce(either, (self._rises(*entry) for entry in entries), False)
             acts = self._truth("acts", both(rises, negated(before)))
             before = either(before, acts)
             if not isinstance(acts, bool):
-                shown = [_shown(self.scope, t) for t, _ in entries if t is not False and not self._is_tick(t)]
+                shown = [self._shown(t) for t, _ in entries if t is not False and not self._is_tick(t)]
                 self._branches.append(Branch(acts, " or ".join(shown)))
             out.append(acts)
         return out
 
-    def reinit(self, acts: Condition, state: VariableSymbol, value: Value) -> None:
+    def reinit(self, acts: Condition, state: VariableSymbol, value: Truth) -> None:
         """Starts a state anew at the end of the iteration in which a branch acts."""
         self._reinits.setdefault(state, []).append((acts, value))
 
@@ -93,28 +147,28 @@ class DiscreteMap:
         """Ends the run where a branch acts."""
         self._ends.append((acts, message))
 
-    def _rises(self, truth: Value, at_start: bool) -> Value:
+    def _rises(self, truth: Truth, at_start: bool) -> Truth:
         """True in the iteration in which a condition becomes true."""
         if isinstance(truth, bool):
             return False  # it never becomes true
-        kept = self.scope.kept.in_discrete(truth)
+        kept = self.kept.in_discrete(truth)
         if isinstance(kept, bool):
             return False
-        started = self.scope.phase(STARTED)
+        started = self.phase(STARTED)
         if self._is_tick(kept):  # true for one iteration: nothing is to be remembered
             return both(kept, started)
         now = self._truth("true", kept)
-        was = self.scope.hidden(f":was[{len(self._conditions)}]", 0)
+        was = self.unshown(f":was[{len(self._conditions)}]", 0.0)
         self._conditions.append((next(iter(now.free_symbols)), was))
         rises = both(now, plain(sympy.Eq(was, 0)))
         return rises if at_start else both(rises, started)
 
-    def _is_tick(self, truth: Value) -> bool:
+    def _is_tick(self, truth: Truth) -> bool:
         """True for a condition that holds at the ticks of clocks only."""
-        ticks = {tick: sympy.Integer(0) for tick in self.scope.ticks.values()}
+        ticks = {tick: sympy.Integer(0) for tick in self.ticks.values()}
         return isinstance(truth, sympy.Basic) and plain(truth.xreplace(ticks)) is False
 
-    def _truth(self, kind: str, condition: Value) -> Value:
+    def _truth(self, kind: str, condition: Truth) -> Truth:
         """A condition as a hidden variable that is 1 or 0, so that what is long stands once."""
         if isinstance(condition, bool):
             return condition
@@ -124,41 +178,40 @@ class DiscreteMap:
 
     def share_relations(self) -> None:
         """Lets bodies see the relations that conditions and equations read as these do, when all of them are known."""
-        self.values = {n: self.scope.kept.in_bodies(value) for n, value in self.values.items()}
+        self.values = {n: self.kept.in_bodies(value) for n, value in self.values.items()}
         for cases in self._reinits.values():
-            cases[:] = [(acts, self.scope.kept.in_bodies(value)) for acts, value in cases]
+            cases[:] = [(acts, self.kept.in_bodies(value)) for acts, value in cases]
 
     # --- what is written ---------------------------------------------------------------------------------------------
 
     def write(self) -> None:
         """Adds the events to the component."""
-        scope = self.scope
-        if not (self.values or self._branches or scope.initial is not None or scope.ticks):
+        if not (self.values or self._branches or self.remembered or self.initial is not None or self.ticks):
             return
         new = {DiscreteSymbol(n): VariableSymbol(f":when:new[{n}]") for n in self.values}
         definitions = {new[DiscreteSymbol(n)]: sympy.sympify(as_number(value)) for n, value in self.values.items()}
         definitions |= self._hidden
-        first = scope.phase(AT_FIRST)
+        first = self.phase(AT_FIRST)
         replaced: dict[sympy.Basic, sympy.Basic] = {
-            previous(s): sympy.Piecewise((as_number(v), first), (previous(s), True), evaluate=False)
-            for s, v in scope.initially.items()
+            self.before(s.path): sympy.Piecewise((as_number(v), first), (self.before(s.path), True), evaluate=False)
+            for s, v in self.initially.items()
         }
         replaced |= new
         definitions = {s: e.xreplace(replaced) for s, e in definitions.items()}
         _check_order(definitions, {v: k.path for k, v in new.items()})
         for symbol, expression in definitions.items():
-            scope.component._hidden(symbol.path, expression)
+            self.component._hidden(symbol.path, expression)
         self._write_events(new, replaced)
 
     def _write_events(self, new: dict[DiscreteSymbol, VariableSymbol], replaced: dict) -> None:
         """The events, in the order in which one waits for another: the start, the equations, the next iteration."""
-        c, scope = self.scope.component, self.scope
+        c = self.component
         solves = EventFlag.AT_START | EventFlag.REVOCABLE | EventFlag.REPEATED
         names = ", ".join(f"'{s.path}'" for s in new) or "whens"
-        starting, started = scope.phase(STARTING), negated(scope.phase(STARTING))
-        initial = scope.initial
+        starting, started = self.phase(STARTING), negated(self.phase(STARTING))
+        initial = self.initial
         assert initial is not None
-        before = [Assign(previous(m), m) for m in new]
+        before = [Assign(self.before(m.path), m) for m in (*new, *self.remembered)]
         c._event(starting, (*before, Assign(initial, sympy.Integer(AT_FIRST))), None, solves, f"start of {names}")
         differs = [self._differs(m, n) for m, n in new.items()]
         pending = self._number("pending", both(started, functools.reduce(either, differs, False)))
@@ -168,18 +221,20 @@ class DiscreteMap:
             c._event(_is(pending), assigned, None, solves, f"equations of {names}")
         settled = both(started, plain(sympy.Eq(pending, 0))) if unsettled else started
         acts = functools.reduce(either, (b.acts for b in self._branches if b.text), False)
-        moves: list[Value] = [plain(sympy.Ne(new[m], previous(m))) for m in new if m.path in self.always]
+        moves: list[Truth] = [plain(sympy.Ne(new[m], self.before(m.path))) for m in new if m.path in self.always]
+        moves += [plain(sympy.Ne(m, self.before(m.path))) for m in self.remembered]
         moves += [plain(sympy.Ne(now, was)) for now, was in self._conditions]
-        moves += [plain(sympy.Eq(tick, 1)) for tick in scope.ticks.values()]
-        goes_on = functools.reduce(either, moves, scope.phase(AT_FIRST))
+        moves += [plain(sympy.Eq(tick, 1)) for tick in self.ticks.values()]
+        goes_on = functools.reduce(either, moves, self.phase(AT_FIRST))
         actions = [
             *(Assign(m, n) for m, n in new.items()),
-            *(Assign(previous(m), n) for m, n in new.items()),
+            *(Assign(self.before(m.path), n) for m, n in new.items()),
+            *(Assign(self.before(m.path), m) for m in self.remembered),
             *(Assign(was, now) for now, was in self._conditions),
-            *(Assign(tick, _unless(pre(initial), pre(tick))) for tick in scope.ticks.values()),
+            *(Assign(tick, _unless(pre(initial), pre(tick))) for tick in self.ticks.values()),
             Assign(initial, sympy.Integer(STARTED)),
         ]
-        ends = [(scope.hidden(f":ends[{k}]", 0), text, when) for k, (when, text) in enumerate(self._ends)]
+        ends = [(self.unshown(f":ends[{k}]", 0.0), text, when) for k, (when, text) in enumerate(self._ends)]
         actions += [Assign(done, as_number(when)) for done, _, when in ends]
         starts = [
             Reinit(x, VariableSymbol(c._hidden(f":when:reinit[{x.path}]", _first(cases, x).xreplace(replaced))))
@@ -195,31 +250,30 @@ class DiscreteMap:
         for done, text, _ in ends:
             c._event(sympy.Eq(done, 1), (Terminate(text),), None, EventFlag.LISTED | EventFlag.AT_START, shown)
 
-    def _differs(self, m: DiscreteSymbol, new: VariableSymbol) -> Value:
+    def _differs(self, m: DiscreteSymbol, new: VariableSymbol) -> Truth:
         """True while a variable has not the value of its equation."""
-        if self.scope.kind(self.scope.declared[m.path].type) != REAL:
+        if m.path not in self.reals:
             return sympy.Ne(m, new)
         return sympy.Gt(sympy.Abs(m - new), SAME * (sympy.Abs(m) + sympy.Abs(new)), evaluate=False)
 
-    def _number(self, kind: str, condition: Value) -> VariableSymbol | None:
+    def _number(self, kind: str, condition: Truth) -> VariableSymbol | None:
         """A hidden variable that is 1 where a condition holds and 0 elsewhere; None where it never does."""
         if isinstance(condition, bool):
             return None
-        return VariableSymbol(self.scope.component._hidden(f":when:{kind}", as_number(condition)))
+        return VariableSymbol(self.component._hidden(f":when:{kind}", as_number(condition)))
 
-
-def _shown(scope: Scope, truth: Value) -> str:
-    """A condition as the text has it."""
-    if not isinstance(truth, sympy.Basic):
-        return str(truth)
-    names: dict[sympy.Basic, sympy.Basic] = {scope.phase(STARTED): sympy.true}
-    for clock, tick in scope.ticks.items():
-        period: Any = sympy.sympify(clock.period)
-        names[sympy.Eq(tick, 1)] = sympy.Symbol(f"sampled({f'{float(period):g}' if period.is_number else period})")
-    for s in truth.free_symbols:
-        if isinstance(s, DiscreteSymbol) and s != scope.initial and s not in scope.ticks.values():
-            names |= dict.fromkeys((sympy.Eq(s, 1), s), sympy.Symbol(str(s).removeprefix(":")))
-    return shortened(truth.xreplace(names))
+    def _shown(self, truth: Truth) -> str:
+        """A condition as the text has it."""
+        if not isinstance(truth, sympy.Basic):
+            return str(truth)
+        names: dict[sympy.Basic, sympy.Basic] = {self.phase(STARTED): sympy.true}
+        for clock, tick in self.ticks.items():
+            period: Any = sympy.sympify(clock.period)
+            names[sympy.Eq(tick, 1)] = sympy.Symbol(f"sampled({f'{float(period):g}' if period.is_number else period})")
+        for s in truth.free_symbols:
+            if isinstance(s, DiscreteSymbol) and s != self.initial and s not in self.ticks.values():
+                names |= dict.fromkeys((sympy.Eq(s, 1), s), sympy.Symbol(str(s).removeprefix(":")))
+        return shortened(truth.xreplace(names))
 
 
 def _is(truth: VariableSymbol) -> Condition:
@@ -232,10 +286,11 @@ def _unless(initial: Expression, tick: Expression) -> Expression:
     return sympy.Piecewise((0, sympy.Eq(initial, STARTED)), (tick, True), evaluate=False)
 
 
-def _first(cases: list[tuple[Condition, Value]], otherwise: Value) -> Expression:
-    value: Value = otherwise
+def _first(cases: list[tuple[Condition, Truth]], otherwise: Expression) -> Expression:
+    """The value of the first case that acts."""
+    value = otherwise
     for acts, result in reversed(cases):
-        value = chosen(acts, result, value)
+        value = sympy.Piecewise((as_number(result), acts), (value, True), evaluate=False)
     return sympy.sympify(value)
 
 
