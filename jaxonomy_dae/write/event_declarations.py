@@ -40,7 +40,7 @@ class EventDeclarations:
     _declare: Callable[..., VariableSymbol]
     _declare_parameter: Callable[..., str]
     _check_parameters_only: Callable[[sympy.Expr, str], None]
-    _without_jumps: Callable[[Condition], Condition]
+    _watchable: Callable[[Condition], Condition]
 
     def discrete(self, name: str, start: Value = 0.0, unit: str = "") -> DiscreteSymbol:
         """Declares a discrete variable: constant but for the events that assign it.
@@ -135,10 +135,12 @@ class EventDeclarations:
         guard, shown = None, text or f"sampled({getattr(clock, 'period', '')})"
         if clock is None:
             shown = text or (str(condition) if on is None else f"{condition}, on={on}")
-            watchable = (
-                condition if EventFlag.RELATION in flags else self._without_jumps(condition)
-            )  # which may add events
+            watchable = condition
+            if EventFlag.RELATION not in flags:
+                watchable = self._watchable(condition)  # which may add events
             expression = guard_of(watchable, where)
+            if is_strict(watchable):
+                flags |= EventFlag.STRICT
             if on is not None:
                 expression = while_on(expression, relation_in_discretes(on, f"{where}, on"))
             expression = while_on(expression, watched)
@@ -153,8 +155,6 @@ class EventDeclarations:
         elif on is not None:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
         values = self._values(actions, len(self.events), where)
-        if is_strict(condition):
-            flags |= EventFlag.STRICT
         self.events.append(When(shown, guard, clock, tuple(actions), values, flags))
 
     def _hidden(self, name: str, expression: sympy.Expr) -> str:

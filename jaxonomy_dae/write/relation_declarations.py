@@ -1,13 +1,13 @@
 """Relations in a component's equations whose changes are events: declared, or found when the component is complete."""
 
 import sympy
-from sympy.logic.boolalg import BooleanAtom
+from sympy.logic.boolalg import BooleanAtom, to_nnf
 
 from ..base.aliases import Condition, Expression
 from ..graph.expressions.to_sympy import shortened
 from .automatic_events import Splitting, Stepping, Turning, jumps, turned, varies, with_events
 from .event_declarations import EventDeclarations
-from .events import LIVE, NO_FLAG, Assign, EventFlag, Sampled, is_strict
+from .events import LIVE, NO_FLAG, Assign, EventFlag, Sampled, is_of_both_kinds, is_strict
 from .symbols import PreviousSymbol, RelationSymbol, VariableSymbol
 from .timed_relations import Edges
 
@@ -50,8 +50,24 @@ class RelationDeclarations(EventDeclarations):
         if numbers.timed and not varies(guarded):
             return live, guarded
         known: Condition = self._hidden_discrete(float(LIVE))
-        self._turns(Turning(known.number, self._without_jumps(guarded), sympy.true))
+        self._turns(Turning(known.number, self._watchable(guarded), sympy.true))
         return turned(known.number, condition), sympy.Eq(known, 1)
+
+    def _watchable(self, condition: Condition) -> Condition:
+        """The condition as one guard can tell it: without jumps, and strict relations apart from others.
+
+        Where the guard is zero the condition is that of the relation whose sides are equal, and a guard knows only
+        whether all of its relations are strict. So strict ones among others are events of their own.
+        """
+        own = self._without_jumps(condition)
+        return self._strict_alone(own) if is_of_both_kinds(own) else own
+
+    def _strict_alone(self, condition: Condition) -> Condition:
+        if isinstance(condition, sympy.Not):
+            return self._strict_alone(to_nnf(condition))
+        if isinstance(condition, sympy.And | sympy.Or):
+            return condition.func(*map(self._strict_alone, condition.args))
+        return self._alone(condition) if is_strict(condition) else condition
 
     def _without_jumps(self, condition: Condition) -> Condition:
         """The condition for a guard that turns where sides jump, as floor(x) does, and moves with these jumps: such a
@@ -69,10 +85,12 @@ class RelationDeclarations(EventDeclarations):
         return own if is_strict(condition) else self._turning_alone(condition, own)
 
     def _turning_alone(self, condition: Condition, own: Condition) -> Condition:
-        if own == condition or not isinstance(own, _ORDERED):
-            return own
+        return own if own == condition or not isinstance(own, _ORDERED) else self._alone(own)
+
+    def _alone(self, relation: Condition) -> Condition:
+        """Declares the events of a relation. Returns the truth that the last of them has left."""
         known = self._hidden_discrete(float(LIVE))
-        self._turns(Turning(known.number, own, sympy.true))
+        self._turns(Turning(known.number, relation, sympy.true))
         return sympy.Eq(known, 1)
 
     def _as_variable(self, side: Expression) -> VariableSymbol:
