@@ -16,7 +16,7 @@ import sympy
 from problems import compiled, component
 from sympy import Abs, And, Heaviside, Max, Min, Mod, Or, Piecewise, ceiling, floor, sign
 
-from jaxonomy_dae import Eq, assign, der, pre, reinit, simulate
+from jaxonomy_dae import Eq, assign, der, pre, reinit, simulate, terminate
 
 TIGHT = dict(rtol=1e-10, atol=1e-10)
 pytestmark = pytest.mark.long("runs of models with events are compiled")
@@ -238,6 +238,49 @@ def test_conditions_of_events_whose_sides_jump():
     np.testing.assert_allclose(values, [sum(end - a / w for a in times) for times in at.values()], atol=1e-10)
     np.testing.assert_allclose(slopes, [sum(a / w**2 for a in times) for times in at.values()], atol=1e-9)
     assert not [name for name in system.variables if ":" in name]
+
+
+# --- strict relations among others -----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_strict_relations_among_others():
+    """x = 1 and y = 0 rest, s = t. Conditions are true at the start as Python says; where one falls at t = p, so does
+    the run's only event. Without an event, gradients of what is on both sides are zero."""
+    conditions = [
+        lambda x, y, d: Or(x < 0, y <= 0), lambda x, y, d: And(x > 0, y <= 0), lambda x, y, d: And(x > 0, y < 0),
+        lambda x, y, d: Or(x < 0, y < 0), lambda x, y, d: sympy.Not(Or(x <= 0, y > 0)),
+        lambda x, y, d: Or(x < 0, And(x > 0, y >= 0)), lambda x, y, d: And(d > 0, y <= 0),
+    ]  # fmt: skip
+
+    def write(self, ev):
+        x, y, s, w = (self.variable(n, **g) for n, g in dict(
+            x=dict(start=1.0, fixed=True), y=dict(start=0.0, fixed=True), s=dict(start=0.0, fixed=True), w={}
+        ).items())  # fmt: skip
+        p, end, d = self.parameter("p", 0.5), self.parameter("end", 0.8), self.discrete("d", start=1)
+        self.add_equations(Eq(der(x), 0), Eq(der(y), 0), Eq(der(s), 1), Eq(w, p * s))
+        for k, condition in enumerate(conditions):
+            self.when(condition(x, y, d), assign(self.discrete(f"n{k}"), 1), at_start=True)
+        self.when(And(s > p, y <= 0), assign(self.discrete("met"), 1))
+        self.when(s >= end, terminate("the end"))
+        self.when(2 * s >= 2 * end, assign(self.discrete("beside"), 1))
+
+    system = compiled(component(write))
+
+    def run(p, end):
+        found = simulate(system.with_parameters({"c.p": p, "c.end": end}), 1.0, max_events=3, save_events=True)
+        events = found.events
+        return jnp.sum(jnp.where(events.which == events.which[0], events.before["c.w"], 0.0)[:1]), found
+
+    run = jax.jit(jax.value_and_grad(run, has_aux=True))
+    (value, found), slope = run(0.5, 0.8)
+    held = [bool(c(1, 0, 1)) for c in conditions]
+    assert [float(found[f"c.n{k}"][-1]) for k in range(len(held))] == held
+    np.testing.assert_allclose([value, slope], [0.25, 1.0], rtol=1e-9)  # p²
+    assert found.events.names == ["c: when((y <= 0) & (s > p))", "c: when(s >= end)", "c: when(2*s >= 2*end)"]
+    assert found.events.terminated == "the end"
+    (_, found), slope = run(5.0, 9.0)
+    assert not len(found.events) and found.events.terminated is None and slope == 0
 
 
 # --- several events at one instant -----------------------------------------------------------------------------------

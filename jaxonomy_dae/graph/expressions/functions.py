@@ -104,8 +104,9 @@ _SERIES = [Fraction(2 * k + 1, 2 ** (2 * k + 1) * math.factorial(k) * math.facto
 
 
 def _bessel_i1_slope(u: Node) -> Node:
-    """I₁′ = I₀ − I₁/u; within |u| < 1 its series, as that quotient is 0/0 at zero, and cancels beside it. The first term
-    left out is below 1e-29, so that the next derivatives keep their digits, too."""
+    """I₁′ = I₀ − I₁/u; within |u| < 1 its series, as that quotient is 0/0 at zero, and cancels beside it.
+
+    The first term left out is below 1e-25, so that the next derivatives keep their digits, too."""
     square, series = _squared(u), ZERO
     for c in reversed(_SERIES):
         series = linear([(1, multiply(square, series))], c)

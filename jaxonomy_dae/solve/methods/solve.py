@@ -28,7 +28,7 @@ from .failures import SHOWN, StartCheck, Stopped, explain_failure, explain_start
 from .index_one import consistent_point, consistent_shift
 from .rodas5p import Rodas5P
 from .rows import not_a_number
-from .solve_arguments import check_longest_step, check_times, jump_times, tolerance_of
+from .solve_arguments import check_longest_step, check_prescribed_steps, check_times, jump_times, tolerance_of
 from .step_control import StepControl
 
 # Newton steps by which algebraic unknowns are solved for at saved times. Dense output starts them within some
@@ -98,6 +98,7 @@ def solve_dae(
         raise ModelError(f"max_steps must be a positive integer that is known beforehand; got {max_steps!r}")
     check_times(t0, t1, ts)
     check_longest_step(dtmax)
+    check_prescribed_steps(t0, t1, stepsize_controller)
     rtol, atol = default_tolerances(rtol, atol, dtype)
     check_tolerances(rtol, atol, dtype)
     # Numbers become arrays, so that another value is not another program.
@@ -256,9 +257,7 @@ def _solve(of: _Given, checked: bool = False):
     return check, out, run.last
 
 
-def _on_constraints(
-    term: diffrax.AbstractTerm, args: Args, ts: Times, ys: State, start: tuple[Time, State]
-) -> State:
+def _on_constraints(term: diffrax.AbstractTerm, args: Args, ts: Times, ys: State, start: tuple[Time, State]) -> State:
     """Saved values with their algebraic unknowns solved for: dense output interpolates those, and no error estimate
     covers how fast they vary within a step."""
     t0, y0 = start
