@@ -50,17 +50,16 @@ class RelationDeclarations(EventDeclarations):
         if numbers.timed and not varies(guarded):
             return live, guarded
         known: Condition = self._hidden_discrete(float(LIVE))
-        self._turns(Turning(known.number, self._watchable(guarded), sympy.true))
+        self._turns(Turning(known.number, self._strict_apart(self._without_jumps(guarded)), sympy.true))
         return turned(known.number, condition), sympy.Eq(known, 1)
 
-    def _watchable(self, condition: Condition) -> Condition:
-        """The condition as one guard can tell it: without jumps, and strict relations apart from others.
+    def _strict_apart(self, condition: Condition) -> Condition:
+        """The condition as one guard can tell it, with relations of one kind.
 
         Where the guard is zero the condition is that of the relation whose sides are equal, and a guard knows only
         whether all of its relations are strict. So strict ones among others are events of their own.
         """
-        own = self._without_jumps(condition)
-        return self._strict_alone(own) if is_of_both_kinds(own) else own
+        return self._strict_alone(condition) if is_of_both_kinds(condition) else condition
 
     def _strict_alone(self, condition: Condition) -> Condition:
         if isinstance(condition, sympy.Not):
@@ -108,7 +107,8 @@ class RelationDeclarations(EventDeclarations):
         new, watched = with_events(tuple(map(self._as_kept, self.equations)), len(self.relations))
         if not watched and all(n is e for n, e in zip(new, self.equations, strict=True)):
             return
-        self.as_written = {n: e for n, e in zip(new, self.equations, strict=True) if n is not e}
+        before, pairs = self.as_written, [*zip(new, self.equations, strict=True)]
+        self.as_written = {n: before.get(e, e) for n, e in pairs if n is not e or e in before}
         self.equations[:] = new
         for each in watched:
             self.relations.extend(each.starts)
