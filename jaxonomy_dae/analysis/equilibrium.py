@@ -32,8 +32,6 @@ from .settled_modes import Point, Root, settle
 from .transient import pseudo_transient
 
 PASSES = 4  # of equilibration: the first one takes scales away, the others balance
-# A singular value below SINGULAR·n·eps of the largest one is rounding. n·eps alone is the usual measure for a matrix
-# with exact entries (NumPy's matrix_rank).
 
 
 class Equilibrium(NamedTuple):
@@ -225,6 +223,8 @@ def open_directions(found: Equilibrium) -> tuple[Float[Array, " k"], Float[Array
             largest = jnp.max(jnp.abs(matrix), axis=axis, keepdims=True, initial=0.0)
             largest = jnp.where(largest > 0, largest, 1)
             matrix = matrix / (jnp.sqrt(largest) if sweep else largest)
+    # Of fewer rows than unknowns, the decomposition would leave out directions that no row sees. Rows of zeros bring
+    # them back.
     padded = jnp.concatenate([matrix, jnp.zeros((max(k - m, 0), k), matrix.dtype)])
     _, values, directions = jnp.linalg.svd(padded, full_matrices=False)
     return values / jnp.where(values[0] > 0, values[0], 1), directions
@@ -232,4 +232,6 @@ def open_directions(found: Equilibrium) -> tuple[Float[Array, " k"], Float[Array
 
 def is_open(values: Float[Array, " k"]) -> Bool[Array, " k"]:
     """True for directions that nothing determines: their singular values are zero up to rounding."""
+    # n·eps alone is the usual measure for a matrix with exact entries (NumPy's matrix_rank). These entries have
+    # rounding errors of their own.
     return values <= ZERO_WITHIN * values.shape[0] * spacing(values.dtype)

@@ -183,6 +183,7 @@ def _written(system: AcausalSystem, t: Time, inputs: Args, x: Array, q: Array) -
     plan = system.plan.some_events
     values = system.around_event(t, q, q, inputs).event_values(x) / jnp.asarray(plan.factor, x.dtype)
     now = jnp.zeros_like(values)
+    # An empty array cannot be indexed, even where the result is not used.
     if len(x):
         now = jnp.where(plan.state >= 0, x[np.maximum(plan.state, 0)], now)
     if len(q):

@@ -90,6 +90,7 @@ def settle(
         keep = (state.rounds & (state.rounds - 1)) == 0
         before = jax.tree.map(lambda a, b: jnp.where(keep, a, b), (after, event), state.before)
         modes = state.modes + jnp.where(fails, 1, 0)
+        # After the last set has failed, this is computed too, and not used.
         flipped = flips[jnp.minimum(modes, len(flips) - 1)]
         anew = begin._replace(q=jnp.where(flipped, 1 - begin.q, begin.q), changed=begin.changed | flipped)
         at = jax.tree.map(lambda a, b, c: jnp.where(settled, a, jnp.where(fails, b, c)), here, anew, after)
@@ -123,4 +124,5 @@ def settle(
     state = jax.lax.while_loop(lambda s: s.goes_on, once, state)
     settled = state.root.good & (state.event < 0)
     last = state.at, state.root, state.event
+    # Of a search that failed, the outcome with the modes of the start is returned: messages name its events.
     return jax.tree.map(lambda a, b: jnp.where(settled, a, b), last, state.first)

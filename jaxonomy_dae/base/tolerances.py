@@ -19,42 +19,44 @@ EPS = 2.0**-52  # the spacing of double precision near one, a bound of the round
 # pass them on.
 KNOWN_ROUNDINGS = 64.0
 KNOWN = KNOWN_ROUNDINGS * EPS
-# Relative: numbers that somebody wrote twice, as a start at each end of a connection, with nine digits or more.
+# Two numbers that differ by less than this part of themselves are meant to be equal: somebody wrote one number twice,
+# as a start at each end of a connection, with nine digits or more.
 MEANT_EQUAL = 1e-9
 TINY = 1e-300  # takes the place of zero in denominators, far below any square of a model's number
 
 # --- sums of which rounding may be left ---------------------------------------------------------------------------
 
-# In units of EPS times the terms: what the sum of a handful of terms, each of them rounded, may be off by.
+# A sum of a handful of terms, each of them rounded, may be off by so many units of EPS times the terms.
 NOISE = 8.0
-# Of the terms: a combination of equations with weights that were computed cancels to this. Weights come out of an
-# elimination, and may have lost some digits. Set by hand.
+# A combination of equations has cancelled if no more than this part of its terms is left. Its weights come out of an
+# elimination, and may have lost some digits. The value is set by hand.
 CANCELLED = 1e-11
-# Entries of a null vector that are left out, relative to its largest: to the first, if columns cancel without them,
-# else to the second, which are the singular value decomposition's own roundings.
+# Small entries of a null vector are left out: those below the first part of its largest entry if the columns cancel
+# without them, and else those below the second part, the rounding of the singular value decomposition itself.
 NO_WEIGHT = (1e-8, 1e-13)
-# Of the largest: less than this in a null vector, or of what is passed on along a graph, has no part in it. Set by
-# hand, between the roundings of an ill-conditioned null vector and the least entry of one that is meant.
+# What has less than this part of the largest entry, in a null vector or in what is passed on along a graph, has no part
+# in it. The value is set by hand, between the roundings of an ill-conditioned null vector and the least entry of one
+# that is meant.
 NO_PART = 1e-6
-# Of the largest: what has less has no part that is worth a word, in an error that names those that depend on each
-# other; and terms that leave more of themselves than this do not cancel. A branch that is another one leaves a part of
-# order one.
+# An error that names what depends on each other leaves out what has less than this part of the largest. And terms do
+# not cancel if more than this part of them is left: another branch of a function leaves a part of order one.
 SLIGHT = 1e-3
-# Relative: pivots that differ by less are equal, so that neither rounding nor the order of summation chooses states.
+# Pivots that differ by less than this part are equal, so that neither rounding nor the order of summation chooses
+# states.
 ALIKE = 1e-6
 
 # --- equations that hold ------------------------------------------------------------------------------------------
 
 CLOSE = 1e3  # in units of EPS times an equation's terms: where a search may end, short of asking for the last digit
-# In units of EPS and of the typical size of a quantity: what cannot be told from zero. A double root at zero is
-# approached by half the way in each step, 46 of 60 to here.
+# What is less than so many units of EPS times the typical size of a quantity cannot be told from zero. A double root at
+# zero is approached by half the way in each step, and 46 of 60 steps lead to here.
 ZERO_WITHIN = 1e2
 DIGIT = 0.1  # relative: what is uncertain by more is not known to its first digit
-# Singular values, relative, of equations whose derivatives vanish in the first order: roots of second order are found
-# to half of the digits.
+# Roots of second order are found to half of the digits. So where derivatives vanish in the first order, the singular
+# values of equations come out as large as this part of the largest.
 HALF_OF_THE_DIGITS = 1e-7
-# Relative change of a constraint along what its linearization leaves free, below which it changes in the third order
-# alone. Points are found to HALF_OF_THE_DIGITS, which second derivatives amplify. Set by hand.
+# A constraint that changes by less than this part, along what its linearization leaves free, changes in the third order
+# alone. Points are found to HALF_OF_THE_DIGITS, and second derivatives amplify that. The value is set by hand.
 UNCHANGED = 1e-5
 
 
@@ -84,35 +86,37 @@ def ridge(dtype: DTypeLike) -> float:
 # --- solutions of linear equations --------------------------------------------------------------------------------
 
 TOLERATED = 2.0**20  # residual of an equation in units of EPS times its terms: 2e-10 in double precision
-# The same in the norm of the equilibrated matrix, and for what is left of the terms of a Schur complement: 6e-14, what
-# elimination with pivoting may leave.
+# The residual in the norm of the equilibrated matrix, and the part of its terms below which a Schur complement is
+# rounding: 6e-14, which elimination with pivoting may leave.
 TOLERATED_NORM = 2.0**8
 UNDETERMINED = 2.0**-4  # of the largest unknown: what changes so by rounding is not known to its first digit
 ILL_CONDITIONED = 1e12  # the condition number from which on a solution has four digits or fewer, which is said
-# Pivots and singular values, relative to the largest, of matrices of which no bounds of errors are known (the
-# Jacobian of constraints that a user's point gives): far above rounding, far below what a mechanism's shape makes.
+# Pivots and singular values below this part of the largest count as zero where no bounds of a matrix's errors are
+# known, as of the Jacobian of constraints at a user's point. This is far above rounding, and far below what a
+# mechanism's shape makes.
 RANK = 1e-10
 
 # --- events -------------------------------------------------------------------------------------------------------
 
 RESOLUTION = 32.0  # spacings of floating-point numbers at the largest time of a run: times that are one instant
-# Of the largest value that a guard has had, in spacings of floating-point numbers: the half-width of the band about
-# zero. Rounding errors of a guard in the states, and of the states themselves, add up to some hundreds of them in the
-# models of the tests. With a tenth, test_hybrid_runs.py::test_nothing_falls_through_a_floor fails; ten times it passes.
+# A guard counts as zero within a band of this half-width, in spacings of floating-point numbers at the largest value
+# that it has had. Rounding errors of a guard in the states, and of the states themselves, add up to some hundreds of
+# spacings in the models of the tests. With a tenth, test_hybrid_runs.py::test_nothing_falls_through_a_floor fails; ten
+# times it passes.
 BAND = 4096.0
-# Part of a step: a guard that would reach zero so soon after its end counts as having reached it. A step that is
+# A guard that would reach zero within this part of a step after its end counts as having reached it. A step that is
 # retried up to a crossing has other errors than the step in which the crossing was located, so that it ends a little
-# off. Set by hand: test_hybrid_runs.py and test_event_map.py pass with ten times it and a tenth.
+# off. The value is set by hand: test_hybrid_runs.py and test_event_map.py pass with ten times it and a tenth.
 WINDOW = 1e-6
-# Largest relative change of a state by the projection onto the constraints after an event. If the projection moves it
-# more, the event asked for what the constraints do not admit, and the projection would decide what was meant
+# The projection onto the constraints after an event may change a state by this part at most. If it moves it more, the
+# event asked for what the constraints do not admit, and the projection would decide what was meant
 # (test_event_attacks.py::test_a_reset_that_hidden_constraints_do_not_admit).
 CONSISTENT = 1e-4
-# Part of the speed (or charge) that an impulse takes away that may be left of it: more shows that no impulse enforces
-# the constraint, as where another one contradicts it.
+# Of a speed (or charge) that an impulse takes away, this part may be left. More shows that no impulse enforces the
+# constraint, as where another one contradicts it.
 LEFT = 1e-6
 PULL = 1e-9  # of the largest impulse: contacts that pull by less do so by rounding alone, and are not released
-# 1/s, relative to the size of a state: a slope that is slower counts as zero in analyses, for it would take 1e17 years
-# to move the state by its size. Parts that friction holds creep so, by its compliance (`library/friction.py`;
-# test_analysis_of_events.py::test_friction_that_sticks).
+# A slope of less than this part of a state's size per second counts as zero in analyses, because it would take 1e17
+# years to move the state by its size. Parts that friction holds creep like this, by its compliance
+# (`library/friction.py`; test_analysis_of_events.py::test_friction_that_sticks).
 AT_REST = 1e-25

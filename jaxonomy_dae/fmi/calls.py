@@ -18,7 +18,8 @@ from .instance import Instance
 STEP = 6e-6  # of central differences, in units of a variable's size: the cube root of the spacing of numbers
 INSTANCES = 64  # for members of a batch, beside two for each parameter, which differences move
 HIDDEN = 1e-8  # a relative change of values after an event, far above rounding and far below what differences move
-# Of differences at events: they are taken as far beyond an event as they move it, where values differ by as much.
+# The step of differences at events, in units of a variable's size. They are taken as far beyond an event as they move
+# it, where values differ by as much.
 NEAR = 1e-7
 LATEST = 1e-2  # in units of the time: the farthest beyond an event from which differences are taken
 

@@ -209,5 +209,7 @@ def _moved(
     params: Mapping[str, Any] = operation.params
     if operation.primitive == "gather":
         params = {**params, "fill_value": 0}
+    # The operation itself is run, on the numbers of entries: so no rule for gathers, pads and slices stands here a
+    # second time.
     moved = operation.source_primitive.bind(*ids, **params)
     return [np.asarray(m) for m in (moved if operation.source_primitive.multiple_results else [moved])]

@@ -12,12 +12,12 @@ from .c_types import number
 from .emit_c import CFunction, Source
 from .programs import RUN, Programs
 
-# Of the tolerance of a run: how far states may be off their constraints before they are moved onto them, which restarts
+# States may be off their constraints by this part of a run's tolerance before they are moved onto them, which restarts
 # an importer's integrator. A hundredth stays far below the errors of steps.
 DRIFT = 0.01
 
-# Of Co-Simulation. Its absolute tolerance is a part of the tolerance and of a state's typical size, the ratio of the
-# defaults of `simulate`; guards are looked at so many times in a step, as often as there.
+# In Co-Simulation the absolute tolerance is this part of the tolerance, times a state's typical size: the ratio of the
+# defaults of `simulate`. Guards are looked at so many times in a step, as often as there.
 ABSOLUTE = 0.01
 LOOKS = 6
 

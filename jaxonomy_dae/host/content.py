@@ -32,7 +32,7 @@ from . import libraries
 from .libraries import Owner, is_as_written, is_impure, owner, place
 
 _PLAIN = frozenset({type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented)})
-# Of a class, what follows from the rest, or tells nothing of what its methods compute.
+# These attributes of a class follow from the rest, or tell nothing of what its methods compute.
 _BESIDE = frozenset({
     "__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__dataclass_fields__",
     "__dataclass_params__", "__match_args__", "__abstractmethods__", "_abc_impl", "__qualname__", "__firstlineno__",

@@ -32,13 +32,14 @@ LIBRARIES = (
     "optax",
     "klujax",
 )
-# Of the standard library, what computes from its arguments alone. All else may read a clock, a file or a random state.
+# These modules of the standard library compute from their arguments alone. All others may read a clock, a file or a
+# random state.
 PURE = frozenset({
     "abc", "bisect", "builtins", "cmath", "collections", "contextlib", "copy", "copyreg", "dataclasses", "enum",
     "fractions", "functools", "heapq", "itertools", "math", "numbers", "operator", "re", "statistics", "string",
     "textwrap", "types", "typing", "warnings",
 })  # fmt: skip
-# What computes from something else, or from names that no reader of the code can follow.
+# These built-in functions compute from something else, or from names that no reader of the code can follow.
 IMPURE = frozenset({
     "open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "getattr", "setattr", "delattr",
     "__import__", "breakpoint", "id", "memoryview", "dir",

@@ -36,8 +36,8 @@ def recalled(content: bytes) -> tuple[str, list[str], PyTree] | None:
         return None
 
 
-# By parts of the names of what programs call: what makes it known to a fresh process, which crashes otherwise. Modules
-# that bring functions of their own add them.
+# Functions that make known to a fresh process what a program calls, by parts of the names of what is called. Without
+# them the process crashes. Modules that bring functions of their own add them.
 REGISTERED: dict[str, Callable[[], object]] = {
     "lapack": functools.cache(lambda: jax.jit(jnp.linalg.inv).lower(np.eye(1))),
 }

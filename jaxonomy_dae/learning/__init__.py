@@ -8,6 +8,7 @@ from .comparison import CrossValidation as CrossValidation
 from .comparison import compare as compare
 from .comparison import cross_validate as cross_validate
 from .data import Data as Data
+from .density import LogDensity as LogDensity
 from .design import Advice as Advice
 from .design import next_experiment as next_experiment
 from .design_search import Design as Design
@@ -38,7 +39,6 @@ from .minimize import Minimized as Minimized
 from .minimize import minimize as minimize
 from .multiple_shooting import Shooting as Shooting
 from .noise import Noise as Noise
-from .posterior import Posterior as Posterior
 from .prediction import Prediction as Prediction
 from .priors import LogNormal as LogNormal
 from .priors import Normal as Normal

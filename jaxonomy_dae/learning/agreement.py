@@ -7,6 +7,7 @@ import scipy.stats
 from jaxtyping import Float, Int
 
 from .descent import Minimum
+from .form import FINE, neighbours, peak, periodogram
 from .objective import Objective
 
 STRONGEST = 0.97  # correlation of neighbours: beyond, a record has too few independent parts for its covariance
@@ -53,28 +54,19 @@ def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
     Missing samples, NaN, are left out."""
     residual = residual[np.isfinite(residual)]
     n = len(residual)
+    lags = max(int(np.log(n)), 1)
     centred = residual - residual.mean()
     power = float(centred @ centred)
-    lags = max(int(np.log(n)), 1)
     if n <= lags + 1 or power == 0:
         return Whiteness(np.nan, np.nan, lags, np.nan)
-    squares = np.abs(np.fft.rfft(centred)[1 : (n + 1) // 2]) ** 2
+    own = (centred / np.sqrt(power / n))[None]
+    spectrum, (statistic, lags) = periodogram(own), neighbours(own)
     rho = np.array([float(centred[k:] @ centred[:-k]) for k in range(1, lags + 1)]) / power
-    statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-    most, period = int(np.argmax(np.abs(rho))), n / (int(np.argmax(squares)) + 1)
+    most = int(np.argmax(np.abs(rho)))
     return Whiteness(
-        correlation=float(rho[0]), statistic=statistic, lags=lags, peak=peak(squares), lag=most + 1,
-        strongest=float(rho[most]), period=period,
+        correlation=float(rho[0]), statistic=float(statistic[0]), lags=lags, peak=float(peak([spectrum])[0]),
+        lag=most + 1, strongest=float(rho[most]), period=FINE * n / (int(np.argmax(spectrum[0])) + 1),
     )  # fmt: skip
-
-
-def peak(squares: Float[np.ndarray, " m"]) -> float:
-    """The probability that the periodogram of white noise has a peak as high as this, relative to its sum: of m
-    frequencies, at most m·(1 − g)^(m − 1) (Fisher 1929, Proc. R. Soc. A 125:54)."""
-    if len(squares) < 2:
-        return 1.0
-    share = float(squares.max() / squares.sum())
-    return min(len(squares) * (1 - share) ** (len(squares) - 1), 1.0)
 
 
 def log_likelihood(objective: Objective, m: Minimum) -> float:

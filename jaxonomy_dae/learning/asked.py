@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.errors import ModelError, nearest
+from ..base.errors import ModelError, by_name, nearest
 from ..compile.diagnosis.unused_parameters import unused_parameters
 from ..compile.model.tables import ZERO
 from ..run.system.system import AcausalSystem
@@ -135,10 +135,14 @@ def as_asked(c: Coordinates, freeze: Any, start: Any, bounds: Mapping[str, Any] 
             raise ModelError("start is a training of other unknowns or experiments: train this problem, or give names")
         c = dataclasses.replace(c, start=known.natural(start.objective.full(start.z)))
     elif start is not None and not isinstance(start, AcausalSystem):
-        values = dict(start)
+        values = by_name("start", start, "'motor.R': 1.2")
     names = [freeze] if isinstance(freeze, str) else freeze
     held = dict(names) if isinstance(names, Mapping) else dict.fromkeys(names)
-    return c.bounded(dict(bounds or {})).changed(values, fixed=False).changed(held, fixed=True)
+    return (
+        c.bounded(by_name("bounds", bounds, "'motor.R': (0.1, 10)"))
+        .changed(values, fixed=False)
+        .changed(held, fixed=True)
+    )
 
 
 def dead_times(delay: Mapping[str, Any], stacked: Stacked, method: Any) -> tuple[Coordinate, ...]:

@@ -147,5 +147,6 @@ def condensed(b: Blocks) -> Float[np.ndarray, "e N m q"]:
     for k in range(b.by_node.shape[1]):
         out.append(b.by_node[:, k] @ slope + b.by_common[:, k])
         if k + 1 < b.by_node.shape[1]:
+            # Gaps have an entry for each state, and nodes move along the constraints alone: the matrix is not square.
             slope = np.linalg.pinv(b.arrive[:, k]) @ (b.leave[:, k] @ slope + b.gap_by_common[:, k])
     return np.stack(out, axis=1)

@@ -24,10 +24,10 @@ PLACES = 24  # at which a step of a disturbance is tried
 # An input is read at so many times between two samples.
 PARTS = 16
 EDGE = 4  # samples on each side of a step
-# Of a column's square. Where less is left of it beside the model's own numbers, these take it up.
+# The model's own numbers take up a column of whose square less than this part is left beside them.
 TAKEN = 1e-4
 DAY = 86400.0  # s
-# Of its size. A state changes its sign if it goes beyond zero by this much on both sides.
+# A state changes its sign if it goes beyond zero by this part of its size on both sides.
 TURNS = 0.02
 FORM = 4  # coefficients of a polynomial that stands for a law of another form
 DAYS = 2  # in a record, from which a daily disturbance is looked for
@@ -181,11 +181,10 @@ def inputs(model: Linearized, fit: "Estimate") -> Iterator[Change]:
     late = float(np.median(np.diff(model.times, axis=1)[model.times[:, 1:] > model.times[:, :-1]])) / 4
     b = (model.along.by_input[:, 1:] + model.along.by_input[:, :-1]) / 2
     for p, name in enumerate(model.inputs):
-        times, values = s.inputs[name]
-        times, kind = times + fit.values.get(f"delay of {name}", 0.0), dict(s.kinds)[name]
+        delay = fit.values.get(f"delay of {name}", 0.0)
 
-        def read(at: np.ndarray, times=times, values=values, kind=kind) -> np.ndarray:
-            return np.stack([sampled(*one, kind) for one in zip(at, times, values, strict=True)])
+        def read(at: np.ndarray, name=name, delay=delay) -> np.ndarray:
+            return np.stack([s.input_at(name, k, times - delay) for k, times in enumerate(at)])
 
         u, before = read(inside), read(inside - late)
         low, high = np.quantile(u, [0.25, 0.75])
@@ -209,13 +208,6 @@ def inputs(model: Linearized, fit: "Estimate") -> Iterator[Change]:
 def between(at: Any) -> Float[np.ndarray, "e n *q"]:
     """Means from each time to the next."""
     return (at[:, 1:] + at[:, :-1]) / 2
-
-
-def sampled(at: np.ndarray, times: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], kind: str) -> np.ndarray:
-    """Samples of an input at other times, curves as if they were straight between them."""
-    if kind != "held":
-        return np.interp(at, times, values)
-    return values[np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)]
 
 
 def _slope(model: Linearized, i: int) -> str:

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from .candidates import DAILY, DAY, EDGE, SLOW, WIDEST, Change, Judge, disturbances, inputs, laws, readings
-from .leftover import FINE, Leftover, Series, periodogram
+from .form import FINE, periodogram
+from .leftover import Leftover, Series
 from .linearized import Linearized
 from .program import Runs
 

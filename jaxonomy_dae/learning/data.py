@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
-from ..base.errors import ModelError, nearest
+from ..base.errors import ModelError, explained_keywords, nearest
 from ..compile.lowering.plan import SystemPlan
 from ..run.system.inputs import KINDS
 from .axes import LEGEND, AxesGiven, chosen_names, grid_of_axes
@@ -23,6 +23,7 @@ class Data:
     They may differ in length, sampling and measured variables. All of them must name the same inputs and starts.
     """
 
+    @explained_keywords({"experiments": "Data(first, second)"})
     def __init__(self, *experiments: Experiment):
         for k, one in enumerate(experiments):
             if not isinstance(one, Experiment):
@@ -134,6 +135,14 @@ class Stacked:
                 "fit() with method='single', or leave it out"
             )
 
+    def input_at(self, name: str, experiment: int, at: np.ndarray) -> np.ndarray:
+        """An input of an experiment at some times: samples that are held, or curves as if they were straight between
+        them."""
+        times, values = (part[experiment] for part in self.inputs[name])
+        if dict(self.kinds)[name] != "held":
+            return np.interp(at, times, values)
+        return values[np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)]
+
     def until(self, share: float) -> "Stacked":
         """A copy of the same shapes in which only this share of each experiment's time counts."""
         if share >= 1:
@@ -184,6 +193,7 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mappin
         outputs=tuple(outputs),
         times=times,
         t0=np.array([one.t0 for one in experiments], float),
+        # What is missing is zero and has the weight zero: not-a-number times zero would not vanish.
         values=np.where(observed, values, 0.0),
         observed=observed,
         sigma=levels,
@@ -279,6 +289,7 @@ def _samples(name: str, source: object, one: Experiment, label: str) -> tuple[np
     """(times, values, kind) of an input; a constant is of any kind."""
     end = float(one.times[-1])
     if isinstance(source, int | float | np.number):
+        # Two times that differ, even for a record of a single sample at its start.
         return np.array([one.t0, max(end, one.t0 + 1.0)]), np.full(2, float(source)), None
     if not isinstance(source, tuple | list) or len(source) not in (2, 3):
         raise ModelError(
@@ -310,6 +321,7 @@ def _samples(name: str, source: object, one: Experiment, label: str) -> tuple[np
 
 def _beyond(times: np.ndarray, m: int) -> np.ndarray:
     """Times continued to m of them, in steps like the last."""
+    # Interpolations need times that increase, so the last one cannot be repeated.
     step = times[-1] - times[-2]
     return np.concatenate([times, times[-1] + step * np.arange(1, m - len(times) + 1)])
 

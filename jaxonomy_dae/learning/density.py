@@ -1,4 +1,4 @@
-"""The density from which posterior samples are drawn: that of which a fit finds the maximum.
+"""The posterior density, of which a fit finds the maximum, as a function of JAX.
 
 With coordinates z as a fit has them, residuals r of the samples, weights w of experiments, and the fit's normal priors,
 
@@ -6,9 +6,9 @@ With coordinates z as a fit has them, residuals r of the samples, weights w of e
 
 with the prior of smoothness of learned laws, linearized at the fit.
 
-Noise levels that are estimated are sampled with the rest, with a flat prior of their logarithm; z is flat where it has
-no prior. Coordinates with bounds are functions of free numbers y (`between`), and the logarithm of dz/dy is added. What
-is sampled is u in
+Noise levels that are estimated are among its arguments, with a flat prior of their logarithm; z is flat where it has
+no prior. Coordinates with bounds are functions of free numbers y (`between`), and the logarithm of dz/dy is added. Its
+argument is u in
 
     (y, ln σ) = centre + root·u,    root·rootᵀ = the inverse of the density's curvature,
 
@@ -17,7 +17,8 @@ forwards, experiment by experiment, as those of a fit are, or backwards where th
 they go backwards.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,23 +28,23 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from ..base.errors import ModelError
+from ..compile.diagnosis.wording import listed
 from ..host.cache import compiled
+from ..host.staging import is_staged
+from ..run.system.system import AcausalSystem
 from .coordinates import Shifts
+from .descent import Minimum
 from .devices import each, each_with_slopes
 from .factors import Factors
 from .objective import Objective
-from .program import AbstractPredictor, Layout, Runs, Setting, Weighted, misfit
-
-if TYPE_CHECKING:
-    from .estimate import Estimate
-
+from .program import AbstractPredictor, Layout, Runs, Setting, Weighted, misfit, with_values
 
 LOST = 100.0  # standard deviation of a coordinate, in its own size or as a logarithm, beyond which nothing is known
 
 
 class Levels(eqx.Module):
-    """Noise levels that are sampled: which there are by experiment and output, their places among the s levels, and for
-    how many samples each counts."""
+    """Noise levels among the arguments: which there are by experiment and output, their places among the s levels, and
+    for how many samples each counts."""
 
     sampled: Bool[Array, "e k"]
     place: Int[Array, " k"]
@@ -55,7 +56,7 @@ class Posed(eqx.Module):
 
     told: Weighted
     levels: Levels
-    natural: Float[Array, " p"]  # of coordinates that are not sampled
+    natural: Float[Array, " p"]  # of coordinates that are no arguments
     chosen: Int[Array, " f"]  # those that are
     log: Bool[Array, " f"]
     size: Float[Array, " f"]
@@ -95,20 +96,25 @@ def between(
 
 
 def coordinates_at(posed: Posed, u: Float[Array, "*n u"]) -> tuple[Array, Array, Array]:
-    """(coordinates sampled, logarithms of noise levels, Σ ln dz/dy) at u."""
+    """(free coordinates, logarithms of noise levels, Σ ln dz/dy) at u."""
     v = posed.centre + u @ posed.root.T
     f = len(posed.chosen)
     z, slope = between(v[..., :f], posed.low, posed.high)
     return z, v[..., f:], jnp.sum(slope, axis=-1)
 
 
+def natural_at(posed: Posed, z: Float[Array, "*n f"]) -> Float[Array, "*n p"]:
+    """The natural values of all coordinates."""
+    values = jnp.where(posed.log, jnp.exp(jnp.where(posed.log, z, 0.0)), z * posed.size)
+    natural = jnp.broadcast_to(posed.natural, (*z.shape[:-1], len(posed.natural))).at[..., posed.chosen].set(values)
+    if posed.shifts is not None:
+        natural = natural.at[..., posed.shifts.into].add(posed.shifts.factor * natural[..., posed.shifts.of])
+    return natural
+
+
 def numbers_at(posed: Posed, layout: Layout, z: Float[Array, " f"]) -> tuple[Float[Array, " s"], Float[Array, "e o"]]:
     """(shared, own) natural values as programs take them."""
-    plain = z * posed.size
-    natural = posed.natural.at[posed.chosen].set(jnp.where(posed.log, jnp.exp(jnp.where(posed.log, z, 0.0)), plain))
-    if posed.shifts is not None:
-        natural = natural.at[posed.shifts.into].add(posed.shifts.factor * natural[posed.shifts.of])
-    e = posed.told.row.shape[0]
+    natural, e = natural_at(posed, z), posed.told.row.shape[0]
     split = len(natural) - e * layout.n_own
     return natural[:split], natural[split:].reshape(e, layout.n_own)
 
@@ -161,22 +167,64 @@ def density(program: Program, posed: Posed, u: Float[Array, " u"]) -> Float[Arra
     return safe(u)
 
 
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class LogDensity:
+    """ln p of all that a fit estimates, up to a constant, from `Estimate.log_density`: `density(u)`, for u of shape
+    `(density.size,)`, under `jit`, `grad` and `vmap`; −∞ where a run fails.
+
+    It is whitened: u = 0 is the estimate, and where the fit's linearization holds, u is normal with covariance one.
+    Bounds are at infinity.
+
+    - `names`: parameters, starts and weights, as in `fit.values`, and noise levels, `"sigma of cell.v"`.
+    """
+
+    program: Program
+    posed: Posed
+    names: tuple[str, ...]
+
+    @property
+    def size(self) -> int:
+        """The number of arguments."""
+        return len(self.names)
+
+    def __call__(self, u: Float[Array, " u"]) -> Float[Array, ""]:
+        """ln p, shape ()."""
+        # A program of its own inside of others would be differentiated when what its rules close over is gone.
+        call = density if is_staged(u) else _density
+        return call(self.program, self.posed, jnp.asarray(u, self.posed.centre.dtype))
+
+    def __repr__(self):
+        return f"LogDensity({self.size} arguments: {listed(self.names, 6)})"
+
+    def values(self, u: Float[Array, "*n u"]) -> dict[str, Float[Array, "*n"]]:
+        """What u says, by name, in the variables' units."""
+        z, logs, _ = coordinates_at(self.posed, jnp.asarray(u, self.posed.centre.dtype))
+        natural = natural_at(self.posed, z)[..., self.posed.chosen]
+        columns = jnp.concatenate([natural, jnp.exp(logs)], axis=-1)
+        return {name: columns[..., k] for k, name in enumerate(self.names)}
+
+    def system(self, u: Float[Array, " u"]) -> AcausalSystem:
+        """The system with the parameters and weights at u, for runs of your own. Starts and sensor laws are in
+        `values`."""
+        z, _, _ = coordinates_at(self.posed, jnp.asarray(u, self.posed.centre.dtype))
+        setting = self.program.setting
+        return with_values(setting, numbers_at(self.posed, setting.layout, z)[0])[0]
+
+
 @compiled
-def density_and_gradient(program: Program, posed: Posed, u: Float[Array, " u"]) -> tuple[Array, Array]:
-    """ln p and its gradient."""
-    return jax.value_and_grad(lambda u: density(program, posed, u))(u)
+def _density(program: Program, posed: Posed, u: Float[Array, " u"]) -> Float[Array, ""]:
+    return density(program, posed, u)
 
 
-def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
-    """The density around an estimate, and the names of noise levels that are sampled.
+def log_density(objective: Objective, minimum: Minimum, point: Float[np.ndarray, " p"]) -> LogDensity:
+    """The density around an estimate. `point`: all its coordinates.
 
     **Raises:**
 
     - `ModelError` where the density has no finite integral: what neither data, priors nor bounds determine, by name.
     """
-    objective, minimum = estimate.objective, estimate.minimum
     s, c, free = objective.stacked, objective.coordinates, objective.free
-    s.check_plain("the sampler")
+    s.check_plain("the density of a posterior")
     names, dtype = objective.evidence.labels, objective.system.parameters.values.dtype
     low, high = objective.bounds
     z, weights = minimum.z, minimum.weights
@@ -206,7 +254,7 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     bends, bend = priors.jacobian[bent], priors.residual[bent] - priors.jacobian[bent] @ z
     levels = Levels(jnp.asarray(sampled), jnp.asarray(place), array(np.where(sampled, counts, 0.0)))
     told = Posed(
-        told=objective.weighted, levels=levels, natural=array(c.natural(estimate.point)),
+        told=objective.weighted, levels=levels, natural=array(c.natural(point)),
         chosen=jnp.asarray(np.flatnonzero(free)), log=jnp.asarray(c.log[free]), size=array(c.size[free]),
         shifts=None if c.shifts is None else c.shifts._replace(factor=array(c.shifts.factor)),
         low=array(low), high=array(high), precision=array(weights.precision), mean=array(weights.mean),
@@ -215,7 +263,8 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     backwards = objective.has_many and isinstance(objective.predictor, Runs)  # filters are differentiated forwards
     predictor = Runs(None) if backwards else objective.predictor
     program = Program(objective.setting, predictor, backwards)
-    return program, told, names
+    labels = (*np.array(c.names)[free].tolist(), *(f"sigma of {name}" for name in names))
+    return LogDensity(program, told, labels)
 
 
 def _root(objective: Objective, factors: Factors, has_prior: np.ndarray, noise: float) -> Float[np.ndarray, "f f"]:
@@ -228,7 +277,7 @@ def _root(objective: Objective, factors: Factors, has_prior: np.ndarray, noise: 
     if lost.any():
         names = np.array(objective.coordinates.names)[objective.free][lost]
         raise ModelError(
-            "the posterior cannot be sampled: neither data, priors nor bounds determine "
+            "the posterior density has no finite integral: neither data, priors nor bounds determine "
             + ", ".join(f"'{n}'" for n in names[:6])
             + ": freeze it, give it two bounds, or a start a spread"
         )

@@ -25,7 +25,7 @@ TRIALS = 12  # dampings tried from one point: the last is 6¹² times the first
 PATIENCE = 3  # steps in a row without gain
 PERSISTENCE = 12  # the same, where what is reported still has a way to go: small gains add up along a curved valley
 OFFSET = 1e-3  # of the confidence region's radius, what may be left to go (Bates & Watts 1981, Technometrics 23:179)
-# Of its standard deviation: how far anything that is reported may still have to go where no step gains more. Errors
+# Where no step gains more, anything that is reported may have so many of its standard deviations left to go. Errors
 # grow by 2 % for it.
 CLOSE = 0.2
 POLISHED = 12  # steps at the end, as long as three of them leave less than a third
@@ -59,8 +59,8 @@ class Minimum:
     resolution: float = dataclasses.field(default=np.nan, kw_only=True)
 
 
-# Better weights, and by which part noise levels and precisions change. The last argument: whether the point is a
-# minimum for the present weights.
+# A function to better weights, and to the part by which noise levels and precisions change. Its last argument says
+# whether the point is a minimum for the present weights.
 Reweigh = Callable[[np.ndarray, Evaluation, Weights, Factors, np.ndarray, bool], tuple[Weights, float]]
 
 

@@ -291,6 +291,7 @@ class _Start:
         middle = 0.5 * (self.low + self.high)
         if not len(places):
             return [self._law(subset, middle)]
+        # Rounding may leave a root just below a whole number, as that of 400 below 20.
         each = max(int(GRID ** (1 / len(places)) + 1e-9), 2)
         axes = [np.linspace(self.low[k], self.high[k], each) for k in places]
         grid = np.tile(middle, (each ** len(places), 1))
@@ -324,6 +325,7 @@ class _Start:
         u, rows = jnp.asarray(self.inputs), 1 if len(inner) == 1 else TOGETHER
         ones = jnp.ones(len(self.terms), u.dtype)
         law = ClosedForm(ones, jnp.ones(len(self.terms), bool), self.terms, jnp.zeros(inner.shape[1], u.dtype))
+        # Filled up to whole parts, so that all of them are calls of one program.
         padded = np.resize(inner, (-(-len(inner) // rows) * rows, inner.shape[1]))
         parts = [padded[k : k + rows] for k in range(0, len(padded), rows)]
         found = np.concatenate([np.asarray(_features(law, jnp.asarray(part, u.dtype), u), float) for part in parts])

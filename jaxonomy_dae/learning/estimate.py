@@ -13,8 +13,10 @@ from ..base.errors import ModelError, explained_keywords, nearest
 from ..base.optional import Axes
 from ..run.system.system import AcausalSystem
 from .agreement import Whiteness, correlated, log_likelihood, rms_by_name, whiteness
+from .at_bounds import AtBound, at_bounds
 from .axes import AxesGiven
 from .band import Band, band, explored
+from .density import LogDensity, log_density
 from .descent import Minimum
 from .discovery import Discovery, discover
 from .experiment import Experiment
@@ -33,7 +35,6 @@ from .unseen import Score, Unseen
 from .verdict import asks_for_starts, reasons
 
 if TYPE_CHECKING:
-    from .posterior import Posterior
     from .problem import Problem
 
 
@@ -87,7 +88,8 @@ class Estimate:
     @property
     def ok(self) -> bool:
         """True if the search converged, χ² agrees with the noise levels, residuals look like white noise, and all
-        unknowns are determined by the data and inside their bounds. `reasons` lists what is wrong."""
+        unknowns are determined by the data, none of which push one against its bound. `reasons` lists what is
+        wrong."""
         return not self.reasons
 
     # --- values ------------------------------------------------------------------------------------------------
@@ -134,6 +136,16 @@ class Estimate:
         moves = ~((z <= low) | (z >= high))
         factors = Factors.of(residual, jacobian[:, moves], self.minimum.noise)
         return factors, np.flatnonzero(self.objective.free)[moves]
+
+    @functools.cached_property
+    def at_bounds(self) -> dict[int, AtBound]:
+        """By their places among all coordinates, those that ended at a bound, and how strongly the data push them
+        against it."""
+        _, moving = self._linear
+        free = np.flatnonzero(self.objective.free)
+        rows = self.minimum.weights.expected(self.minimum.z, self.minimum.found)
+        found = at_bounds(rows, np.isin(free, moving), self.minimum.noise)
+        return {int(free[k]): one for k, one in found.items()}
 
     @functools.cached_property
     def root(self) -> Float[np.ndarray, "p r"]:
@@ -194,9 +206,13 @@ class Estimate:
     def freedom(self) -> float:
         """Degrees of freedom: samples, each as often as its experiment's weight says, less the effective number of
         coordinates (the sum of leverages)."""
-        weights, root = self.minimum.weights, self.root[self.objective.free]
-        leverages = np.sum((weights.informing[:, None] * self.minimum.found.jacobian @ root) ** 2)
-        return weights.samples - float(leverages)
+        return self.minimum.weights.samples - float(np.sum(self.taken))
+
+    @functools.cached_property
+    def taken(self) -> Float[np.ndarray, " m"]:
+        """Of the noise of each sample that was fitted, what the estimates took: leverages."""
+        root = self.root[self.objective.free]
+        return np.sum((self.minimum.weights.informing[:, None] * self.minimum.found.jacobian @ root) ** 2, axis=1)
 
     @property
     def chi2(self) -> float:
@@ -252,11 +268,13 @@ class Estimate:
     @explained_keywords()
     def table(self, level: float = 0.95, *, white: bool = True) -> Table:
         """Parameters and starts with linearized intervals on the coordinates' scale, so that intervals of positive
-        parameters are positive. Notes mark values that reached a bound, are not determined, or were frozen. Estimated
-        noise levels have χ² intervals. With `white=False` the intervals hold if residuals are correlated in time."""
-        noise = noise_intervals(self.objective, self.minimum, self.root, level)
+        parameters are positive. Notes mark values that reached a bound, are not determined, or were frozen. The
+        interval of a value that reached a bound is the part inside the bound. Estimated noise levels have χ² intervals.
+        With `white=False` the intervals hold if residuals are correlated in time."""
+        noise = noise_intervals(self.objective, self.minimum, self.taken, level)
         spread = self.spread if white else self.correlated_spread
-        return intervals(self.objective, self.point, spread, self._unknown, self.quantile(level), level, noise)
+        factor = self.quantile(level)
+        return intervals(self.objective, self.point, spread, self._unknown, factor, level, noise, self.at_bounds)
 
     @functools.cached_property
     def _unknown(self) -> Float[np.ndarray, " p"]:
@@ -362,34 +380,25 @@ class Estimate:
         `along`."""
         return explored(self, name, along)
 
-    @explained_keywords()
-    def sample(self, draws: int = 500, *, chains: int = 4, warmup: int = 150, seed: int = 0) -> "Posterior":
-        """Samples of the posterior density, whose maximum is the fit, by the No-U-Turn sampler (Hoffman & Gelman 2014;
-        extra `bayes`). Use it if intervals from a linearization are not good enough.
+    def log_density(self) -> LogDensity:
+        """ln of the posterior density, whose maximum is the fit, as a function of JAX, for samplers such as BlackJAX's.
+        Use them if intervals from a linearization are not good enough.
 
-        Coordinates, bounds and priors are those of the fit; estimated noise levels are sampled, too. Precisions of
-        weights keep their estimated values. Steps are scaled by the linearized covariance. Each gradient costs as much
-        as a Jacobian of the fit. A draw of parameters takes three to seven gradients; networks with many weights take
-        hundreds, and their chains may not agree.
+        ```python
+        density = fit.log_density()
+        warmup = blackjax.window_adaptation(blackjax.nuts, density)
+        (state, tuned), _ = warmup.run(jax.random.key(0), jnp.zeros(density.size), 200)
+        ```
 
-        **Arguments:**
-
-        - `draws`: of each chain.
-        - `chains`: the number of chains. Each begins at another point around the estimate, and their agreement shows
-            whether there are enough draws.
-        - `warmup`: the number of steps before them, which adapt the step length.
-        - `seed`: the seed of all random numbers.
+        Coordinates, bounds and priors are those of the fit. Estimated noise levels are among the arguments. Precisions
+        of weights keep their estimated values. Each gradient costs as much as a Jacobian of the fit.
 
         **Raises:**
 
         - `ModelError` if the density has no finite integral; the text names what neither data, priors nor bounds
             determine.
-        - `SimulationError` if runs fail all around the estimate.
-        - `ImportError` without BlackJAX.
         """
-        from .posterior import sample
-
-        return sample(self, draws, chains, warmup, seed)
+        return log_density(self.objective, self.minimum, self.point)
 
     @explained_keywords()
     def filtered(

@@ -20,12 +20,12 @@ from ..host.threads import one_thread
 from .evaluation import Evaluation, Weights
 from .factors import Factors
 
-# A prior of smoothness may weigh so much more than the data at most, in squares of their columns.
+# A prior of smoothness weighs so many times as much as the data at most, by the squares of their columns.
 HEAVIEST = 1e4
 # A prior that is a smaller part of the heaviest one is lost in rounding.
 LIGHTEST = 1e-16
-# Where the data determine fewer degrees of freedom than this of what a prior of derivatives is about, it need not be
-# stronger.
+# A prior of derivatives does not become stronger where the data determine fewer degrees of freedom than this of what it
+# is about.
 FAINT = 0.1
 NEAR = 2.0  # χ² for each sample, beyond which it is the misfit that speaks, and precisions of priors stay as they are
 

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jax.typing import ArrayLike
 
-from ..base.errors import ModelError, explained, explained_keywords, nearest, whole_number
+from ..base.errors import ModelError, by_name, explained, explained_keywords, nearest, whole_number
 from ..compile.lowering.plan import SystemPlan
 from .noise import ESTIMATE, Noise
 from .priors import is_finite
@@ -85,6 +85,8 @@ class Experiment:
         object.__setattr__(self, "times", _times(self.times, self.t0))
         if not isinstance(self.data, Mapping) or not self.data:
             raise ModelError(f"data is a dictionary by variables' names, {{'m.x': values}}; got {self.data!r}")
+        by_name("initial", self.initial, "'motor.w': Unknown(0.0)")
+        by_name("inputs", self.inputs, "'motor.u': (times, values)")
         count = len(self.times)
         object.__setattr__(self, "data", {name: _samples(name, v, count) for name, v in self.data.items()})
         object.__setattr__(self, "sigma", self._sigmas())

@@ -9,6 +9,7 @@ import scipy.optimize
 import scipy.stats
 from jaxtyping import Float
 
+from .at_bounds import AtBound
 from .coordinates import end_text
 from .descent import Minimum
 from .evaluation import Weights
@@ -58,6 +59,7 @@ def profile(
         cost = np.inf if reached is None else reached.cost
         if reached is not None:
             warm[0] = reached.z
+        # Finite where a run fails, since the search for a root needs numbers.
         return min(cost + own_cost - best, 1e6) - allowed
 
     centre = float(point[position])
@@ -82,10 +84,10 @@ def profile(
 
 def intervals(
     objective: Objective, point: Float[np.ndarray, " p"], spreads: Float[np.ndarray, " p"],
-    scale: Float[np.ndarray, " p"], factor: float, level: float, noise: list[Row],
+    scale: Float[np.ndarray, " p"], factor: float, level: float, noise: list[Row], ends: dict[int, AtBound],
 ) -> Table:  # fmt: skip
     """As `Estimate.table`: parameters and starts, with what is to be said of each, and noise levels. `scale`: the
-    spread at which a coordinate counts as not determined."""
+    spread at which a coordinate counts as not determined; `ends`: the coordinates that ended at a bound."""
     c = objective.coordinates
     low, high = c.z_bounds
     natural = c.natural(point)
@@ -93,13 +95,14 @@ def intervals(
     away = objective.ran_away(point)
     scalars = np.array([not name.endswith("]") for name in c.names])  # such as a sensor law's gain
     for k in np.flatnonzero(~c.is_weight | scalars).tolist():
-        z, spread, note = point[k], spreads[k], ""
-        ends = z - factor * spread, z + factor * spread
+        at = ends.get(k, AtBound(0.0, spreads[k]))
+        z, spread, note = point[k], at.spread, ""
+        inside_of = z + at.beyond - factor * spread, z + at.beyond + factor * spread
         if k not in moved:
             note = "frozen" if c.fixed[k] else "held out: fitted to this experiment alone"
             if not c.fixed[k] and objective.has_no_weight[k]:
                 note = "no weight: kept at its guess"
-        elif z <= low[k] or z >= high[k]:
+        elif k in ends and (spread < scale[k] or at.is_pushed):
             note = f"bound reached: {end_text(natural[k])}"
         elif away[k]:
             note = "ran away"
@@ -111,18 +114,17 @@ def intervals(
         inside = (-np.inf, np.inf)
         # A factor beyond which no search goes says nothing, however many digits its ends have.
         if np.isfinite(spread) and not (c.log[k] and factor * spread > np.log(AWAY)):
-            inside = np.clip([c.natural_at(k, e) for e in ends], c.low[k], c.high[k])
+            inside = np.clip([c.natural_at(k, e) for e in inside_of], c.low[k], c.high[k])
         rows.append(Row(c.names[k], float(natural[k]), float(inside[0]), float(inside[1]), c.units[k], note))
     return Table((*rows, *noise), level)
 
 
-def noise_intervals(objective: Objective, minimum: Minimum, root: Float[np.ndarray, "p r"], level: float) -> list[Row]:
+def noise_intervals(objective: Objective, minimum: Minimum, taken: Float[np.ndarray, " m"], level: float) -> list[Row]:
     """Noise levels that were estimated: ν·s²/σ² is χ² of ν degrees of freedom, those of the samples less what the
     coordinates took of them."""
     weights, evidence = minimum.weights, objective.evidence
     variables = objective.system.plan.flat.variables
     units = dict(zip(variables.names, variables.unit, strict=True))
-    taken = np.sum((weights.informing[:, None] * minimum.found.jacobian @ root[objective.free]) ** 2, axis=1)
     rows = []
     for k, name in enumerate(evidence.labels):
         own = evidence.noise == k

@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import chdtr, chdtrc
 
 from ..host.threads import one_thread
+from .form import neighbours, of_several, peak, periodogram, slow
 from .outliers import heavy_tails, outliers
 
 if TYPE_CHECKING:
@@ -32,17 +33,16 @@ if TYPE_CHECKING:
 
 # The share of right models that is doubted: fewer than one in twenty, whatever other reasons add.
 LEVEL = 0.02
-# Of residuals, so that the level is a whole number of them. All fits of a model have the same draws: with 499 of these,
-# the level of one oscillator was 3.1 %.
+# So many sets of residuals are drawn that the level is a whole number of them. All fits of a model have the same draws:
+# with 499 of them, the level of one oscillator was 3.1 %.
 DRAWS = 1999
 SURE = 499  # draws after which a third of the level counts as below it: the level itself looks so once in 300 times
 BATCH = 50  # draws at once: most right models are known by the first
 ROOM = 2e7  # numbers at once: 160 MB
 # Residuals below this part of the noise that was stated, as those of exact data, need not look like noise.
 BELOW = 0.1
+LEAST = 0.5  # of a degree of freedom: what is less is rounding, or a trace of priors
 FEWEST = 4  # samples of a series, below which there is nothing to correlate
-SHORTEST = 8  # frequencies of a record below which its lowest ones are those that a fit takes away
-FINE = 2  # frequencies for each that is independent: a peak between two of these loses up to three fifths of its power
 ALIKE = 1e-3  # of the greatest singular value: signals that differ by less are one
 
 
@@ -92,9 +92,11 @@ class Leftover:
         experiment, _, output = o.rows
         share = m.weights.share
         leverage = m.weights.informing[:, None] * m.found.jacobian @ fit.root[o.free]
-        known = o.evidence.noise < 0 if not o.has_variances else np.zeros(len(share), bool)
+        # Samples that are all used up by numbers of the model leave rounding, of which nothing is to be said.
+        has_left = fit.freedom > LEAST
+        known = (o.evidence.noise < 0) & (has_left and not o.has_variances)
         count = float(np.sum(share[known] ** 2))
-        chosen = [Series(k, j, np.flatnonzero((experiment == k) & (output == j))) for k, j in counts]
+        chosen = [Series(k, j, np.flatnonzero((experiment == k) & (output == j))) for k, j in counts if has_left]
         series = tuple(one for one in chosen if len(one.at) >= FEWEST)
         found = []
         for j in dict.fromkeys(one.output for one in series):
@@ -115,6 +117,8 @@ class Leftover:
         """Residuals as a right model would leave them."""
         left, sizes = self._factors
         noise, own = rng.standard_normal((count, len(self.share))), rng.standard_normal((count, len(sizes)))
+        # `own` is the noise of the priors. With it, the covariance of what is left is exactly I − L Lᵀ. Without priors
+        # the sizes are one, and nothing is added.
         taken = sizes * ((self.share * noise) @ left) + np.sqrt(1 - sizes**2) * own
         return noise - (taken * sizes) @ left.T / self.share
 
@@ -152,26 +156,28 @@ class Leftover:
             found["χ²"] = chdtrc(self.freedom, chi2)
         if self.loose:
             sums = [np.sum((self.share * residuals)[:, at] ** 2, axis=1) for at, _ in self.loose]
-            found["small χ²"] = _any([chdtr(free, chi2) for (_, free), chi2 in zip(self.loose, sums, strict=True)])
+            found["small χ²"] = of_several(
+                [chdtr(free, chi2) for (_, free), chi2 in zip(self.loose, sums, strict=True)]
+            )
         if not self.series:
             return found
-        scaled, spectra, neighbours = np.array(residuals), [], []
+        scaled, spectra, correlations = np.array(residuals), [], []
         for one in self.series:
             own = residuals[:, one.at]
             size = np.sqrt(np.mean(own**2, axis=1, keepdims=True))
             own = scaled[:, one.at] = own / np.where(size > 0, size, 1.0)
             spectra.append(periodogram(own))
-            neighbours.append(_neighbours(own))
-        found["outliers"] = _any([heavy_tails(scaled[:, at]) for at in self.by_output.values()])
-        found["neighbours"] = _any([chdtrc(lags, statistic) for statistic, lags in neighbours])
-        if len(neighbours) > 1:
-            statistics, lags = zip(*neighbours, strict=True)
+            correlations.append(neighbours(own))
+        found["outliers"] = of_several([heavy_tails(scaled[:, at]) for at in self.by_output.values()])
+        found["neighbours"] = of_several([chdtrc(lags, statistic) for statistic, lags in correlations])
+        if len(correlations) > 1:
+            statistics, lags = zip(*correlations, strict=True)
             found["all neighbours"] = chdtrc(sum(lags), sum(statistics))
-        found["peak"] = _any([_peak([one]) for one in spectra])
+        found["peak"] = of_several([peak([one]) for one in spectra])
         together = self._together
         if len(together) < len(spectra):
-            found["common peak"] = _any([_peak([spectra[k] for k in group]) for group in together])
-        found["slow"] = _slow(spectra, self._left)
+            found["common peak"] = of_several([peak([spectra[k] for k in group]) for group in together])
+        found["slow"] = slow(spectra, self._left)
         squares = [np.sum((scaled[:, one.at] @ one.basis) ** 2, axis=1) for one in self.signals]
         found["signals"] = chdtrc(sum(one.count for one in self.signals), np.sum(squares, axis=0))
         return found
@@ -218,45 +224,6 @@ class Leftover:
         """The series that have their frequencies in common: of as many samples. A mode shows in all of them."""
         sizes = [len(one.at) for one in self.series]
         return [[k for k, n in enumerate(sizes) if n == size] for size in dict.fromkeys(sizes)]
-
-
-def periodogram(values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "s f"]:
-    """The power at frequencies half as far apart as independent ones, above zero; of mean one for white noise."""
-    n = values.shape[1]
-    return np.abs(np.fft.rfft(values, FINE * n)[:, 1 : FINE * n // 2]) ** 2 / n
-
-
-def _any(each: list[Float[np.ndarray, " s"]]) -> Float[np.ndarray, " s"]:
-    """The probability of the least of several (Bonferroni)."""
-    return np.minimum(np.min(each, axis=0) * len(each), 1.0)
-
-
-def _neighbours(own: Float[np.ndarray, "s n"]) -> tuple[Float[np.ndarray, " s"], int]:
-    """(Ljung and Box's statistic of numbers of mean square one, its lags: ln n, as Tsay 2010 advises)."""
-    n = own.shape[1]
-    lags = max(int(np.log(n)), 1)
-    terms = [(np.sum(own[:, k:] * own[:, :-k], axis=1) / n) ** 2 / (n - k) for k in range(1, lags + 1)]
-    return n * (n + 2) * np.sum(terms, axis=0), lags
-
-
-def _peak(spectra: list[Float[np.ndarray, "s _"]]) -> Float[np.ndarray, " s"]:
-    """The probability of the highest peak of some spectra together: χ² at each frequency, times how many there are, of
-    which neighbours depend on each other."""
-    highest = np.max(sum(spectra), axis=1)
-    return np.minimum(0.75 * spectra[0].shape[1] * chdtrc(2 * len(spectra), 2 * highest), 1.0)
-
-
-def _slow(spectra: list[Float[np.ndarray, "s _"]], left: list[Float[np.ndarray, " _"]]) -> Float[np.ndarray, " s"]:
-    """The probability of the power at the lowest frequencies of all spectra together, up to a quarter of them."""
-    chosen = [k for k, one in enumerate(spectra) if one.shape[1] >= SHORTEST * FINE]
-    if not chosen:
-        return np.ones(len(spectra[0]))
-    lines = [np.concatenate([left[k][None], spectra[k]])[:, FINE - 1 :: FINE] for k in chosen]
-    each = []
-    for count in 2 ** np.arange(int(np.log2(max(one.shape[1] for one in lines) / 4)) + 1):
-        power = np.sum([2 * np.sum(one[:, : min(count, one.shape[1] // 4)], axis=1) for one in lines], axis=0)
-        each.append(chdtrc(max(power[0], 1.0), power[1:]))
-    return _any(each)
 
 
 def signals(
@@ -306,6 +273,6 @@ def _parts(fit: "Estimate", series: list[Series]) -> list[tuple[np.ndarray, np.n
     for one in series:
         k, i = one.experiment, rows[one.at]
         t = s.times[k, i]
-        inputs = {name: np.interp(t, times[k], values[k]) for name, (times, values) in s.inputs.items()}
+        inputs = {name: s.input_at(name, k, t - fit.values.get(f"delay of {name}", 0.0)) for name in s.inputs}
         parts.append((errors[one.at] + s.values[k, i, one.output], t, inputs))
     return parts

@@ -139,5 +139,5 @@ class Linearized:
         return np.einsum("mf,mfq->mq", self.along.read[experiment, row, output], moved[experiment, row])
 
 
-# Of a state's size. A slope that differs from another state by no more than this is that state.
+# A slope that differs from another state by no more than this part of its size is that state.
 NO_MORE = 1e-6

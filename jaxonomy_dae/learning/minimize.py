@@ -139,6 +139,7 @@ def minimize(
     history: list[float] = []
     best, best_step, message = trainable, 0, f"all {steps} steps were taken"
     with tqdm(total=steps, disable=not progress, desc="minimize", unit="step") as bar:
+        # A step returns the loss before its update, so the loss of the last iterate takes one more.
         for k in range(steps + 1):
             value, finite, following, following_state = step(trainable, frozen, state, args)
             number = float(value)

@@ -94,7 +94,8 @@ class Objective:
     coordinates: Coordinates
     penalties: dict[str, float | str | None]  # "evidence" or a precision, by the name of a group
     counted: Bool[np.ndarray, " e"]
-    # Over a part of the time, the centre of the priors of weights, free coordinates; None: zero, over all of it.
+    # The centre of the priors of weights, by free coordinates, in a search over a part of the time. None stands for
+    # zero, in one over all of it.
     near: Float[np.ndarray, " f"] | None = dataclasses.field(default=None, kw_only=True)
     # What is told of each step: its number, the cost, χ² for each sample, and what remains.
     watch: Callable[[int, float, float, float], None] | None = dataclasses.field(default=None, kw_only=True)
@@ -102,7 +103,8 @@ class Objective:
     # Networks with a prior of smoothness, and where they have it.
     laws: tuple[Law, ...] = dataclasses.field(default=(), kw_only=True)
     predictor: AbstractPredictor = dataclasses.field(default=Runs(), kw_only=True)
-    # The correlation of neighbouring errors of each output; None: as the data say, and where it is unknown, zero.
+    # The correlation of neighbouring errors of each output. None stands for what the data say, and for zero where they
+    # do not say it.
     correlations: Float[np.ndarray, " k"] | None = dataclasses.field(default=None, kw_only=True)
 
     @property

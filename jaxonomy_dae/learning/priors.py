@@ -92,5 +92,7 @@ def _checked(name: str, prior: Any, table: ParameterNames) -> Prior:
 
 
 def is_finite(value: object) -> TypeGuard[float]:
-    """True for a finite number."""
-    return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)
+    """True for a finite number; True and False are none."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return False
+    return math.isfinite(value)

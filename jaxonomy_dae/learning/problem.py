@@ -12,7 +12,15 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..base.errors import ModelError, SimulationError, explained_keywords, keywords_of, whole_number, wrong_keyword
+from ..base.errors import (
+    ModelError,
+    SimulationError,
+    by_name,
+    explained_keywords,
+    keywords_of,
+    whole_number,
+    wrong_keyword,
+)
 from ..run.simulation.simulate import simulate
 from ..run.system.system import AcausalSystem
 from ..solve.methods.solve import check_tolerances, default_tolerances
@@ -45,8 +53,8 @@ from .training import GradientSteps, Training, train
 from .verdict import FitWarning
 
 GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
-# Starts of a network that follow where χ² is improbable: of four fits of Stribeck's friction, two end in a local
-# minimum, so that of three starts all do in one of eight.
+# So many more starts of a network follow where χ² is improbable. Of four fits of Stribeck's friction, two end in a
+# local minimum, so that all of three starts do in one of eight cases.
 AGAIN = 2
 MORE = 4  # the same of parameters alone: of 30 records of two tanks, a third ended in a local minimum
 ENOUGH = 100  # evaluations of these, unless the search before took more: they cost no more than it did
@@ -130,14 +138,14 @@ class Problem:
         if not isinstance(system, AcausalSystem):
             raise ModelError(f"Problem needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
         self.system = system
-        self.observers = dict(observe or {})
+        self.observers = by_name("observe", observe, "'gauge.y': law")
         for name, law in self.observers.items():
             if not callable(law):
                 raise ModelError(f"observe: '{name}' needs a function of a solution; got {law!r}")
             if name in system.neural or name in system.plan.variable_index:
                 raise ModelError(f"observe: '{name}' is the name of a network or variable: choose another")
         self.data = data if isinstance(data, Data) else Data(data)
-        self.starts = dict(starts or {})
+        self.starts = by_name("starts", starts, "'motor.w': Unknown(0.0)")
         dtype = system.parameters.values.dtype
         rtol, atol = default_tolerances(rtol, atol, dtype)
         check_tolerances(rtol, atol, dtype)
@@ -146,12 +154,16 @@ class Problem:
         # Names of parameters, one by one, and of networks and sensor laws.
         self.trained = names_to_train(system, self.observers, train)
         self.method = checked_method(system, method)
-        self.delay = dict(delay or {})
+        self.delay = by_name("delay", delay, "'motor.u': Unknown(0.1)")
         self._stacked = self.stacked(self.data)
         self._layout = self.layout_of(self._stacked)
         unknown = [*self.trained[0], *self._layout.shared, *self._layout.own]
         table = system.parameters.table
-        self.priors = priors_by_name(priors or {}, table, [name for name in unknown if name in table.names])
+        self.priors = priors_by_name(
+            by_name("priors", priors, "'motor.R': Normal(1.2, 0.1)"),
+            table,
+            [name for name in unknown if name in table.names],
+        )
         self.penalties = penalties(system, self.trained[1], regularize)
 
     # --- set-up ------------------------------------------------------------------------------------------------

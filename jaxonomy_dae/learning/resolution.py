@@ -14,8 +14,9 @@ from jaxtyping import Float
 from .descent import Minimum
 from .objective import Objective
 
-# Of the noise, the square root of the sum of squares of errors: no estimate moves by more of its standard deviations,
-# and most by far less, as errors share but a part of any one's direction.
+# The errors of an integration may be so large, as the root of their sum of squares in units of the noise. No estimate
+# then moves by more of its standard deviations, and most move by far less, because errors share but a part of any one's
+# direction.
 NOTICED = 0.5
 EXACT = 1e-9  # of an output's size: the 30th bit, beyond what instruments tell. Errors below are those of exact data.
 # A run at this part of the tolerance shows the error of a run at the tolerance.
@@ -36,6 +37,7 @@ def resolved(objective: Objective, found: Minimum, steps: int) -> tuple[Objectiv
         found = dataclasses.replace(found, resolution=error)
         if error <= NOTICED:
             break
+        # Errors fall about in proportion to the tolerance.
         finer = here.finer(float(np.clip(SAFE * NOTICED / error, 1e-4, 0.5 * BESIDE)))
         again = None if finer is None else finer.lowest(found.z, steps, first=found.weights)
         if finer is None or again is None:

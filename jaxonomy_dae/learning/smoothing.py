@@ -73,6 +73,8 @@ def _inverse(p: Float[np.ndarray, "f f"]) -> Float[np.ndarray, "f f"]:
     """The inverse of a covariance on the directions in which there is any."""
     size = np.sqrt(np.maximum(np.diag(p), 0.0))
     size = np.where(size > 0, size, 1.0)
+    # Hidden constraints, and states that no noise reaches, make a covariance singular. It is scaled first, since units
+    # of states would decide which of its eigenvalues count as zero.
     return np.linalg.pinv(p / np.outer(size, size), rcond=SINGULAR, hermitian=True) / np.outer(size, size)
 
 

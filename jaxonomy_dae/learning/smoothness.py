@@ -148,6 +148,7 @@ def _bends(
         return h, h
 
     along = jnp.asarray(directions(len(size)), points.dtype) * size
+    # Backwards, because there are more weights than derivatives.
     each = jax.vmap(jax.jacrev(one, has_aux=True), in_axes=(None, None, 0))
     slope, value = jax.vmap(each, in_axes=(None, 0, None))(flat, points, along)
     return value, slope

@@ -200,6 +200,7 @@ def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSt
         loss, gradient = found
         if not held_out and plan.batch is None and following == 1.0 and loss < state.best_value:
             state.best, state.best_value, state.best_step = state.z, loss, state.step
+        # Optax raises floats to integer powers, which strict promotion of dtypes refuses.
         with jax.numpy_dtype_promotion("standard"):
             updates, state.optimizer = plan.optimizer.update(
                 jnp.asarray(gradient), state.optimizer, jnp.asarray(state.z)

@@ -11,7 +11,7 @@ from scipy.special import chdtr
 from ..compile.diagnosis.wording import listed
 from .causes import described
 from .held_out import missed
-from .leftover import BELOW, LEVEL, Leftover
+from .leftover import BELOW, LEAST, LEVEL, Leftover
 from .objective import AWAY
 from .resolution import EXACT, NOTICED
 
@@ -33,7 +33,7 @@ def reasons(fit: "Estimate") -> tuple[str, ...]:
         found.append(f"{fit.message}: go on from its point, fit(start=fit.values)")
     elif not fit.minimum.converged:
         found.append(f"{fit.message}: start elsewhere, with starts=10 or horizons=(0.1, 0.3, 1), or allow more steps=")
-    for check in (_resolution, _leftover, _held_out, _table):
+    for check in (_resolution, _freedom, _leftover, _held_out, _table):
         found.extend(check(fit))
     return tuple(found)
 
@@ -41,9 +41,8 @@ def reasons(fit: "Estimate") -> tuple[str, ...]:
 def asks_for_starts(fit: "Estimate") -> bool:
     """True if the search ended short of a minimum, ran away or against a bound, or left over what is no noise. Outliers
     and noise levels that were stated too large are no reason to search elsewhere."""
-    notes = [row.note for row in fit.table()]
-    lost = any(note == "ran away" or note.startswith("bound reached") for note in notes)
-    return lost or not fit.minimum.converged or bool(_judged(fit)[1] & ({"χ²"} | COLOURS))
+    lost = any(row.note == "ran away" for row in fit.table())
+    return lost or bool(_pushed(fit)) or not fit.minimum.converged or bool(_judged(fit)[1] & ({"χ²"} | COLOURS))
 
 
 def _judged(fit: "Estimate") -> tuple[Leftover, set[str]]:
@@ -171,6 +170,23 @@ def _resolution(fit: "Estimate") -> list[str]:
     ]
 
 
+def _freedom(fit: "Estimate") -> list[str]:
+    """Noise levels and correlations to be estimated, of which too few samples are left to tell."""
+    s, evidence, rows = fit.objective.stacked, fit.objective.evidence, fit.objective.rows
+    share, taken = fit.minimum.weights.share, fit.taken
+    found = []
+    for k, name in enumerate(evidence.labels):
+        own = evidence.noise == k
+        colours = np.count_nonzero(np.isnan(s.rho[np.unique(rows[2][own])]))
+        if np.sum(share[own] ** 2 - taken[own]) - colours < LEAST:
+            found.append(
+                f"of '{name}' there are too few samples ({np.count_nonzero(own)}) to tell, beside the model's numbers, "
+                f"how large{' and how correlated' * bool(colours)} the noise is: give more of them, or "
+                f"sigma={{'{name}': ...}}"
+            )
+    return found
+
+
 def _held_out(fit: "Estimate") -> list[str]:
     """Experiments held out that are missed by more than noise and intervals explain."""
     found = missed(fit.objective, fit.point, fit.root, fit.sigma, fit.freedom)
@@ -185,10 +201,16 @@ def _held_out(fit: "Estimate") -> list[str]:
     ]
 
 
+def _pushed(fit: "Estimate") -> list[str]:
+    """Numbers that the data push against a bound: a right model's rarely are, even where the truth lies on it."""
+    pushed = {fit.objective.coordinates.names[k] for k, at in fit.at_bounds.items() if at.is_pushed}
+    return [row.name for row in fit.table() if row.name in pushed]
+
+
 def _table(fit: "Estimate") -> list[str]:
-    """Numbers that reached a bound, or that the data do not determine."""
+    """Numbers that the data push against a bound, or do not determine."""
     rows, found = fit.table(), []
-    ends = [row.name for row in rows if row.note.startswith("bound reached")]
+    ends = _pushed(fit)
     lost = [row.name for row in rows if row.note == "not determined"]
     away = [row.name for row in rows if row.note == "ran away"]
     if away:

@@ -27,8 +27,9 @@ from .arguments import in_order
 from .one_axis import AboutAxis, Compliant
 
 STANDSTILL = 1e-6  # m/s or rad/s: slower parts that are pressed together stick at once
-# Acceleration of stuck parts per friction, below any rounding in SI units, and a normal number in single precision. It
-# determines the friction of parts that a source moves: zero while they rest, beyond any breakaway once they start.
+# Stuck parts accelerate by so much per friction. This is below any rounding in SI units, and a normal number in single
+# precision. It determines the friction of parts that a source moves: zero while they rest, and beyond any breakaway
+# once they start.
 COMPLIANCE = 1e-30
 
 

@@ -174,6 +174,8 @@ def _matched(
         other = candidates[k][1][0][1]
         return len(candidates[k][1]) == 1 and isinstance(other, tree.Reference) and not is_discrete(_name(other))
 
+    # Equations that may serve a continuous variable instead come last: they are left over only where no discrete
+    # variable needs them.
     for k in sorted(range(len(candidates)), key=may_be_left):
         if not place(k, set()):
             s, sides = candidates[k]

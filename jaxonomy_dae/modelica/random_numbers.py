@@ -92,6 +92,8 @@ def numbers(name: str) -> Callable[..., Numeric]:
 
     def function(*state: Numeric) -> Numeric:
         whole = [jnp.asarray(s).astype(jnp.int64) for s in state]
+        # A half may be negative. Cut to 32 bits it keeps its own bits, and does not fill those of the other half with
+        # ones.
         unsigned = [w.astype(jnp.uint32).astype(jnp.uint64) for w in whole]
         words = [low | high << 32 for low, high in zip(unsigned[0:32:2], unsigned[1:32:2], strict=True)]
         word, words, place = step(words, whole[-1], lambda w: w)

@@ -34,7 +34,6 @@ CLOSING = {
     ("run/simulation/solution", "run/simulation/energy_balance"): "the balance of a solution is that of a second run",
     ("learning/*", "learning/estimate"): "an estimate's methods call the modules that read it",
     ("learning/estimate", "learning/problem"): "a problem makes the estimates that know it",
-    ("learning/estimate", "learning/posterior"): "an estimate's method, with an optional package",
 }
 
 

@@ -1,8 +1,11 @@
 """The test of what a fit leaves over, on linear fits: its level, and what it finds."""
 
+import types
+
 import numpy as np
 import pytest
 
+from jaxonomy_dae.learning.data import Stacked
 from jaxonomy_dae.learning.leftover import LEVEL, Leftover, Series, signals
 
 N, T = 120, np.linspace(0.0, 1.0, 120)
@@ -66,3 +69,12 @@ def test_what_cannot_be_judged_is_not():
     assert left(np.ones((2, N)), series=(), signals=()).found.keys() == {"χ²"}
     nothing = left(np.zeros((2, N)))
     assert nothing.probability > LEVEL
+
+
+@pytest.mark.parametrize("kind, expected", [("held", [0.0, 0.0, 1.0, 1.0, 0.0]), ("linear", [0.0, 0.5, 1.0, 0.5, 0.0])])
+def test_inputs_are_read_as_their_kind_says(kind, expected):
+    """Residuals of a heater that is switched were held against one that ramps from sample to sample."""
+    record = types.SimpleNamespace(
+        inputs={"u": (np.array([[0.0, 2.0, 4.0]]), np.array([[0.0, 1.0, 0.0]]))}, kinds=[("u", kind)]
+    )
+    np.testing.assert_array_equal(Stacked.input_at(record, "u", 0, np.arange(5.0)), expected)  # pyright: ignore[reportArgumentType]

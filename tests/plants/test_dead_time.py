@@ -12,6 +12,7 @@ from problems import compiled, component
 from sympy import Eq
 
 from jaxonomy_dae import der, learning
+from jaxonomy_dae.base.errors import by_name
 from jaxonomy_dae.errors import ModelError
 
 K, TAU, SIGMA = 1.3, 0.37, 0.23
@@ -117,3 +118,27 @@ def test_keywords_that_others_hand_on_are_checked_where_they_are_written():
     ]:
         with pytest.raises(ModelError, match=text):
             call()
+
+
+def test_what_is_by_name_and_what_is_not():
+    """A list in place of a dictionary, and a keyword of `Data`, were raw TypeErrors."""
+    with pytest.raises(ModelError, match=r"delay is a dictionary by names, delay=\{'m.u': 0.1\}; got \[0.1\]"):
+        by_name("delay", [0.1], "'m.u': 0.1")
+    assert by_name("delay", None, "") == {} and by_name("delay", {"m.u": 1.0}, "") == {"m.u": 1.0}
+    with pytest.raises(ModelError, match=r"Data: there is no argument 'experiments': write Data\(first, second\)"):
+        learning.Data(experiments=[])  # pyright: ignore[reportCallIssue]
+    with pytest.raises(ModelError, match="Data: there is no argument 'name': it takes none by name"):
+        learning.Data(name="a")  # pyright: ignore[reportCallIssue]
+
+
+@pytest.mark.slow
+def test_a_dead_time_of_zero_is_no_fault():
+    """Half of such records end at the bound, which was a reason against the fit."""
+    ends = 0
+    for seed in range(6):
+        y = shown("linear", tau=0.0, sigma=0.0)[0] + 0.01 * np.random.default_rng(seed).standard_normal(60)
+        fit = posed("linear", y, {"c.u": learning.Unknown(0.1)}).fit(warn=False)
+        row = fit.table()["delay of c.u"]
+        ends += row.value == 0
+        assert fit.ok and row.low == 0 and 0 < row.high < 0.05
+    assert ends

@@ -14,5 +14,6 @@ from .kinds import SteadyStateError as SteadyStateError
 from .kinds import StructuralError as StructuralError
 from .kinds import UnitError as UnitError
 from .kinds import UnknownAttribute as UnknownAttribute
+from .wrong_values import by_name as by_name
 from .wrong_values import nearest as nearest
 from .wrong_values import whole_number as whole_number

@@ -56,7 +56,10 @@ def keywords_of(function: Callable[..., Any]) -> list[str]:
 
 def wrong_keyword(where: str, name: str, known: list[str], elsewhere: Mapping[str, str] = NOWHERE) -> str:
     """The text of an error about a keyword that a call does not have."""
-    here = f"write {elsewhere[name]}" if name in elsewhere else nearest(name, known)
+    if name in elsewhere:
+        here = f"write {elsewhere[name]}"
+    else:
+        here = nearest(name, known) if known else "it takes none by name."
     return f"{where}: there is no argument '{name}': {here}"
 
 

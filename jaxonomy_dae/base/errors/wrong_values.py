@@ -1,7 +1,8 @@
 """Checks of values, and suggestions of names, that all rooms share."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from .kinds import ModelError
 
@@ -16,6 +17,18 @@ def nearest(name: str, known: Iterable[str]) -> str:
         return "there are none."
     shown = ", ".join(repr(k) for k in known[:8])
     return f"known names: {shown}{', …' if len(known) > 8 else '.'}"
+
+
+def by_name(what: str, given: object, example: str) -> dict[str, Any]:
+    """A copy of what the argument `what` says by name; nothing, if it is None.
+
+    **Raises:**
+
+    - `ModelError` for what is no dictionary, with an `example` of an entry.
+    """
+    if given is not None and not isinstance(given, Mapping):
+        raise ModelError(f"{what} is a dictionary by names, {what}={{{example}}}; got {given!r}")
+    return dict(given or {})
 
 
 def whole_number(value: object, what: str, least: int = 1) -> int:

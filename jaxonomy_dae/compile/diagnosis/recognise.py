@@ -81,6 +81,7 @@ def _known(entries: Entries, n_variables: int) -> tuple[np.ndarray, list[int]]:
     """For each variable, the equation that determines it alone (−1: none); and the equations all of whose variables are
     known."""
     count = np.bincount(entries.row, minlength=entries.n_rows)
+    # `bincount` adds weights as floating-point numbers, which are exact for integers up to 2⁵³.
     total = np.bincount(entries.row, np.arange(len(entries.row), dtype=float), entries.n_rows)
     determined_by = np.full(n_variables, -1, np.int64)
     twice = np.flatnonzero(count == 0).tolist()
@@ -139,6 +140,7 @@ def _loops(entries: Entries, determined_by: np.ndarray) -> list[list[int]]:
     parts, part = connected_components(sp.coo_array((np.ones(m), (u, v)), shape=(n, n)), directed=False)
     balanced = np.zeros(parts, bool)
     balanced[part] = label[:n] != label[n:]
+    # A tree has one edge less than nodes. Each further edge of a part closes a circle.
     surplus = np.bincount(part[u], minlength=parts) - np.bincount(part, minlength=parts) + 1
     found: list[list[int]] = []
     for p in np.flatnonzero(balanced & (surplus > 0)).tolist():

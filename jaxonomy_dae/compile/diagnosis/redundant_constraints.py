@@ -308,6 +308,8 @@ def _ties(flat: FlatModel, alias: AliasTable, demand: dict[int, np.ndarray]) -> 
     left = {v: np.array(d) for v, d in demand.items()}
     scale = max(float(np.abs(d).max()) for d in demand.values()) if demand else 1.0
     open_ = {v: set(numbers) for v, numbers in at.items()}
+    # From the leaves inwards: the one edge that is left at a leaf must carry all that is demanded there. Edges in
+    # circles are never reached, because nothing says how they share it.
     queue = collections.deque(v for v, numbers in open_.items() if len(numbers) == 1)
     names = set()
     while queue:
@@ -339,6 +341,8 @@ def behind(flat: FlatModel, alias: AliasTable, equations: Sequence[Provenance]) 
     for group in flat.groups:
         for source, variables in zip(group.provenance, group.variable.tolist(), strict=True):
             if (source.component, source.statement) in wanted:
+                # Equal demands of opposite signs would cancel where they meet in a tree, and hide the components
+                # beyond.
                 demand.update((v, random.uniform(0.5, 1.5, 1)) for v in variables if v != ZERO and v not in demand)
     names = {component for component, _ in wanted} | _ties(flat, alias, demand)
     return _named(flat, names)

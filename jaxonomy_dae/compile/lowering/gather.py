@@ -19,8 +19,8 @@ Chunk = Any  # an array of shape (n,), a scalar, or a tuple of scalars
 
 
 FEW = 256  # entries that are read as scalars together
-# A gather takes so many operations beside one for each array that it reads. Values that come in no more pieces than
-# that are sliced and joined instead.
+# A gather takes so many operations beside one for each array that it reads. Values that come in no more pieces are
+# sliced and joined instead.
 GATHER = 2
 SCALARS = 32  # up to this many states, or inputs, tracing is done on scalars
 

@@ -120,6 +120,8 @@ class Dependencies:
             return
         guessed = step.torn
         places = [self.place[quantities] for quantities in guessed]
+        # The derivatives of what a block computes follow from those of its guesses, so both depend on the places of all
+        # its guesses.
         rows = self.union(owner, quantity, n, places)
         self._store(rows, step.unknown)
         self.residuals.extend([rows] * len(guessed))

@@ -103,4 +103,6 @@ def _weight(graph: Node, argument: Node, constant: set[Hashable]) -> Node | None
 
 def _some(k: int) -> Node:
     """A number of no importance, another one for each k."""
+    # Values such as 1 and 2 could make a factor of the model zero by chance. Fractional parts of square roots have no
+    # simple relations.
     return number(0.5 + math.sqrt(2 + k) % 1)

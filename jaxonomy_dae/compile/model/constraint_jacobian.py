@@ -42,6 +42,8 @@ def constraint_entries(groups: tuple[EquationGroup, ...], extended: Extended) ->
         column = np.where(used, quantities.column[group.variable], 0)
         used &= column < quantities.n_unknown_columns
         highest = quantities.highest[np.where(used, column, 0)]
+        # The coefficient of the highest derivative is the same at every level, ∂F⁽ᶜ⁾/∂x⁽ᵈ⁾ = ∂F/∂x⁽ᵈ⁻ᶜ⁾ (Griewank's
+        # lemma; Pryce 2001), so the equations as written give it and need not be differentiated.
         used &= (group.order + count[:, None] == highest) & (highest > 0)
         instance, slot = np.nonzero(used)
         if not len(instance):

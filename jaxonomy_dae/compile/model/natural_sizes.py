@@ -17,12 +17,13 @@ ROUNDS = 3  # of least squares: entries depend on sizes, and are evaluated anew 
 STEP = 1e-3  # of the logarithm of an argument
 FARTHEST = 100.0  # decades from one that a size may be looked for
 STEEPEST = 8.0  # power that an entry is taken for
-# Keeps sizes that nothing tells where they are. A size at the end of a chain of n links hangs on its beginning with a
-# singular value near 2/n, and of normal equations 1e-12 is left beside rounding.
+# A damping keeps sizes that nothing tells where they are. It must be small: a size at the end of a chain of n links
+# hangs on its beginning with a singular value near 2/n. Its square, 1e-12, is what normal equations have beside
+# rounding.
 DAMPING = 1e-6
 STIFFER = 100.0  # times DAMPING, again and again, until no size moves by more than FARTHEST
-# Weight of a decade by which a derivative is off its quantity over the model's time scale: what equations tell wins by
-# its square, and it wins over DAMPING by as much.
+# The weight of a decade by which a derivative is off its quantity over the model's time scale. What equations tell wins
+# over it by its square, and it wins over DAMPING by as much.
 SLOW = 1e-3
 RELUCTANCE = 0.1  # weight of a decade by which a size has moved, beside one by which a term is off
 

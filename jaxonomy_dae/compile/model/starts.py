@@ -83,6 +83,7 @@ class Starts(Sequence[Start | None]):
     def is_zero(self) -> np.ndarray:
         """True for variables whose start is the number zero."""
         most = max((int(group.parameter.max(initial=-1)) for group in self.groups), default=-1)
+        # Only starts that read no parameters count, so any values of parameters will do.
         return self.is_number & (self.values(np.ones(most + 1)) == 0.0)
 
     def values(self, parameters: np.ndarray) -> np.ndarray:

@@ -15,8 +15,9 @@ from ...compile.model.group import Point
 from ...compile.model.jacobian import residual_and_jacobian
 from ..system.system import AcausalSystem
 
-# Of the range of a variable: error estimates bound one step, and those of many steps add up. A pressure that moved by
-# 1/200 of its range by the tolerance of one step ended 1/30 off (test_tolerances.py::test_an_amplified_tolerance).
+# What the tolerance of one step moves by more than this part of its range is told, because the errors of many steps add
+# up. A pressure that moved by 1/200 of its range by the tolerance of one step ended 1/30 off
+# (test_tolerances.py::test_an_amplified_tolerance).
 NOTABLE = 1e-3
 STEADY = 1e-3  # of its size: a variable that moves by less is compared with its size
 MORE = 10.0  # than the relative tolerance of a variable, or of its typical size: less is rounding, or as asked for

@@ -44,10 +44,8 @@ REST = (
     "Say how the model rests: a mode in which it stays (complementary(…, rest_speed=…), contacts.HardStop; a discrete "
     "variable that the event assigns and the equations read), or when(…, terminate(…)) before"
 )
-OKAY: tuple[Result, Result] = (
-    diffrax.RESULTS.successful,
-    diffrax.RESULTS.event_occurred,
-)  # what `diffrax.is_okay` accepts
+# What `diffrax.is_okay` accepts.
+OKAY: tuple[Result, Result] = (diffrax.RESULTS.successful, diffrax.RESULTS.event_occurred)
 PROBES = 64  # times at which inputs are looked at
 
 
@@ -319,6 +317,7 @@ def _accumulation(times: np.ndarray) -> str:
     ratios = apart[1:] / apart[:-1]
     if ratios.max() >= SHRINKING:
         return ""
+    # The times that are left are a geometric series.
     end = times[-1] + apart[-1] * ratios[-1] / (1 - ratios[-1])
     return f"the times between them shrink, each to {ratios[-1]:.3g} of the one before, and accumulate at t={end:.6g}"
 

@@ -16,12 +16,12 @@ from ...host.cache import compiled
 from ..system.system import AcausalSystem
 
 ITERATIONS = 20  # Gauss–Newton steps onto the manifold
-# Parts of what is left of the interval. Speeds become infinite where a mechanism is stretched, so that a run stops a
-# little before; prescribed steps stop up to a step before.
+# A solution is looked for at these parts of what is left of the interval. Speeds become infinite where a mechanism is
+# stretched, so that a run stops a little before, and prescribed steps stop up to a step before.
 BEYOND = np.concatenate([10.0 ** np.arange(-12, -1), np.arange(0.1, 1.05, 0.1)])
 LIMIT = 0.1  # of its size: how far a state is followed, since its slope may be near a pole
-# Part of the way along the field by which a search may lead back. Along a manifold it is of the order of the step;
-# where the manifold ends it is all of it.
+# A search may lead back by this part of the way along the field. Along a manifold it leads back by the order of the
+# step, and where the manifold ends, all of the way.
 BACK = 0.5
 
 

@@ -347,6 +347,7 @@ class Solution(eqx.Module):
         - `ModelError` inside jit, for a batch, for a solution with rows that were not reached, and for a model whose
             events write states or discrete variables, because such events may change the stored energy at an instant.
         """
+        # Imported here, because it runs `simulate`, which imports this module.
         from .energy_balance import energy_balance
 
         return energy_balance(self, rtol, atol).error

@@ -13,8 +13,8 @@ from ...base.aliases import Time
 from ...solve.adjoint.ends import End
 
 QUARTER = 0.5 * jnp.pi  # of a turn, radians
-# Of a quarter: shorter steps look at a wave 16 times in a period, and are left alone, because an implicit solver pays
-# for every change of its step size.
+# Steps shorter than this part of a quarter look at a wave 16 times in a period. They are left alone, because an
+# implicit solver pays for every change of its step size.
 SHORT = 0.25
 HERE = 1e-6  # of a quarter: a step that ends at an extreme, or so close to it, leads to the next one
 ROUNDINGS = 16  # of the angle: as far from an extreme as times are known, where many periods have passed

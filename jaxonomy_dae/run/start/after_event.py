@@ -26,7 +26,7 @@ def with_blocks_solved(at: SystemAt, x: Array) -> Array:
     if not m:
         return x
     solved = at.refined(x, Refinement.ROOT)
-    # The ladder is dense.
+    # The ladder's algebra is dense, and takes too long for many unknowns.
     if m > DENSE_UPTO:
         return jnp.where(jnp.all(jnp.isfinite(solved)), solved, x)
 

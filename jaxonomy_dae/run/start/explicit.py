@@ -59,6 +59,7 @@ def substitution(plan: SystemPlan, rows: InitialRows) -> Substitution | None:
             open_ = [u for u in equations[k] if row[u] < 0]
             if len(open_) > 1:
                 continue
+            # A row whose coefficient is zero or unknown goes too: it does not determine its unknown later either.
             waiting.remove(k)
             if open_ and np.isfinite(equations[k][open_[0]]) and equations[k][open_[0]] != 0.0:
                 (u,) = open_

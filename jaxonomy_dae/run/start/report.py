@@ -27,9 +27,9 @@ from .singular_blocks import BlockFinding, examine_blocks
 from .sparse_newton import sparse_rows
 
 WORST = 5  # rows that do not hold, in a text
-SUSPICIOUS = (
-    1 / HALF_OF_THE_DIGITS
-)  # the condition number from which on constraints are asked whether they are redundant
+# A point is known to half of the digits, so that constraints which depend on each other may show no more than this
+# condition number. From here on they are asked whether they are redundant.
+SUSPICIOUS = 1 / HALF_OF_THE_DIGITS
 
 
 class Guess(NamedTuple):
@@ -140,6 +140,7 @@ class InitializationReport(Sections):
             if row is not None and row.given < 0 and row.start is not None:
                 guess = row.start.value(parameters) / row.factor
             name = plan.quantity_name[q]
+            # A sum with zero turns −0 into 0, as it is printed.
             out.append(Guess(name, guess + 0.0, float(self._x[k]) + 0.0))
         return out
 
@@ -285,7 +286,7 @@ class InitializationReport(Sections):
 
     def _examine(self):
         with jax.ensure_compile_time_eval():
-            # Those of a system whose parameters were solved for belong to the values before.
+            # If parameters were solved for, the system's typical sizes belong to the values before, and are found anew.
             sizes = None if self.solved else np.asarray(self._system.typical_sizes, float)
             yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read, sizes, SUSPICIOUS)
 

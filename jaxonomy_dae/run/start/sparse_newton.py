@@ -111,6 +111,7 @@ def sparse_newton(
         weight, least, *_ = last
         value, values = jax.lax.stop_gradient((function(x), jacobian(x)))
         size, noise = sizes_of_rows(x, values)
+        # The weights of the start are kept: sums of squares with different weights cannot be compared.
         weight = jnp.where(least < jnp.inf, weight, largest(values))
         # Redundant rows fall with those they follow from, and would only weigh them twice.
         merit = jnp.sqrt(jnp.sum((weight * value)[rows.core] ** 2))

@@ -41,8 +41,8 @@ class _Program:
         return self._content.digest, tuple(map(Hidden, self._content.unseen))
 
 
-# By what they are made of. Parts of a key are programs of their own, so that keys stay flat: the rules for derivatives
-# of a user's checks contain each other, and as nested tuples they were too deep to be compared.
+# All programs, by what they are made of. Parts of a key are programs of their own, so that keys stay flat: the rules
+# for derivatives of a user's checks contain each other, and as nested tuples they were too deep to be compared.
 _PROGRAMS: weakref.WeakValueDictionary[Hashable, _Program] = weakref.WeakValueDictionary()
 
 
@@ -88,6 +88,8 @@ def closed_function(function: Callable[[Any], Any], dtype: Any) -> ClosedFunctio
 def _with_numbers_lifted(jaxpr: Any) -> tuple[Any, list[Any]]:
     """The numbers written in a program become constants, so that other numbers are not another program."""
     literal = private("Literal")
+    # Only numbers at the top level are lifted. Those inside loops and inner functions stay part of the program, so
+    # another number there is compiled anew.
     atoms = [atom for equation in jaxpr.eqns for atom in equation.invars] + list(jaxpr.outvars)
     lifted = [atom for atom in atoms if isinstance(atom, literal) and _is_data(atom)]
     if not lifted:
@@ -188,6 +190,7 @@ def _key(value: Any, inside: tuple[Hashable, ...] = ()) -> Hashable:
         hash(value)
     except TypeError:
         return _Same(value)
+    # With the type, because 1, 1.0 and True are equal in Python, and are different parameters of a primitive.
     return type(value), value
 
 

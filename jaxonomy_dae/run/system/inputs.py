@@ -122,6 +122,7 @@ def _read(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
         return value
     if isinstance(value, diffrax.LinearInterpolation | diffrax.CubicInterpolation):
         return _interpolation(name, value, shape)
+    # A path of another kind shows no samples at which steps could end, so it is read as a function of time.
     if isinstance(value, diffrax.AbstractPath):
         value = value.evaluate
     if callable(value):

@@ -72,10 +72,14 @@ class Measured(Evaluation):
     def linear(self, block: Linear) -> list[Array]:
         unknowns = super().linear(block)
         values, local, _ = block.at(unknowns)
+        # The equations of the block read the magnitudes of its own unknowns while these are being found. Their values
+        # stand in for them.
         known = [jnp.abs(u) for u in unknowns]
         first = len(self.magnitudes)
         self.magnitudes.extend(known)
         terms = [self.terms_of(values.equation(equation, local), known) for equation in block.planned.equations]
+        # The bound |A⁻¹|·terms would take a solve for each equation. One solve is enough for an estimate, because signs
+        # without a pattern rarely cancel in a row of A⁻¹.
         right = [jnp.asarray(_signs(rows), self.dtype) * size for rows, size in zip(block.rows, terms, strict=True)]
         found = block.solve(right, False)
         self.magnitudes[first:] = [jnp.maximum(jnp.abs(f), k) for f, k in zip(found, known, strict=True)]

@@ -93,6 +93,7 @@ class ParameterNames:
             group.take(rows) for group in self.dependents if (rows := ~np.isin(group.target, chosen)).any()
         )
         expressions = {k: text for k, text in self.expressions.items() if k not in chosen}
+        # The digest alone tells tables apart, so it must say what was taken out.
         digest = f"{self.digest} given {list(map(int, chosen))}"
         return dataclasses.replace(self, dependents=dependents, expressions=expressions, digest=digest)
 
@@ -274,6 +275,7 @@ class Parameters(eqx.Module):
         if is_staged((array, given)):
             array = _with_values(self.table, array, given)
         elif is_traced((array, given)):
+            # Numbers go as arrays: as Python numbers, each value would make a program of its own.
             array = _set(self.table, array, {n: v if is_traced(v) else on_device(v) for n, v in given.items()})
         else:
             array = np.array(array)

@@ -86,6 +86,7 @@ class AcausalSystem(eqx.Module):
     @property
     def report(self):
         """The report of the compiler, to be printed."""
+        # Imported where it is needed: reports, starts and exports read systems, and import this module themselves.
         from .report import SystemReport
 
         return SystemReport(self.plan, self.parameters.known)

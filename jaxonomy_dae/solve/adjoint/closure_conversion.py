@@ -32,8 +32,8 @@ class SolveProgram(eqx.Module):
     max_steps: int | None = eqx.field(static=True)
     chunk: int = eqx.field(static=True)  # attempted steps between two points where the solve can be taken up again
     points: int = eqx.field(static=True)  # how many such points are kept
-    # Of products of matrices, when the solve was called: JAX asks for derivatives when that context has been left, and
-    # would trace all functions anew for another one, and keep two of each in the program.
+    # The precision of products of matrices when the solve was called. JAX asks for derivatives when that context has
+    # been left, and would trace all functions anew for another precision, and keep two of each in the program.
     precision: str | None = eqx.field(static=True)
 
 

@@ -104,6 +104,8 @@ class _LateTimes(diffrax.AbstractAdjoint):
         )
         count = len(ts)
         shapes = eqx.filter_eval_shape(save.fn, t0, state.y, given["args"])
+        # As Diffrax would begin: rows that are not reached stay infinite. The counters in the buffer of the last point
+        # are zero, since nothing is saved at t0.
         saved = dataclasses.replace(
             state.save_state["last"],
             ts=jnp.full((count,), jnp.inf, t0.dtype),

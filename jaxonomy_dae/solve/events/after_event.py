@@ -21,15 +21,15 @@ from .side import ABOVE, BELOW, RESTS, rounding
 # After an event the state is followed back along its new slope over the delay δ, so that the step ends at a constant
 # time. A state whose slope changes by more than this part during δ is not: it is faster than δ, and the way back is
 # wrong.
-# Set by hand: test_hybrid_runs.py and test_event_map.py pass with ten times it and a tenth.
+# The value is set by hand: test_hybrid_runs.py and test_event_map.py pass with ten times it and a tenth.
 STEADY = 0.1
-# Of a step: how far ahead the rate of a guard at zero is evaluated, for the sign of its second derivative. That is
-# found up to a part AHEAD, and rounding in it is 1/AHEAD times that of rates. Set by hand: the tests named above pass
-# with ten times it and a tenth.
+# The rate of a guard at zero is evaluated this part of a step ahead, for the sign of its second derivative. The
+# derivative is found up to a part AHEAD, and rounding in it is 1/AHEAD times that of rates. The value is set by hand:
+# the tests named above pass with ten times it and a tenth.
 AHEAD = 1e-3
-# Steps within which a guard leaves the band about zero that is really pulled out of it: rounding in the forces on what
-# is at rest takes longer. With a tenth, test_hybrid_runs.py::test_nothing_falls_through_a_floor fails; ten times it
-# passes.
+# A guard that is really pulled out of the band about zero leaves it within so many steps. Rounding in the forces on
+# what is at rest takes longer. With a tenth, test_hybrid_runs.py::test_nothing_falls_through_a_floor fails; ten times
+# it passes.
 SINKING = 4.0
 
 

@@ -26,8 +26,8 @@ from .side import ABOVE, BELOW, RESTS, rounding
 LOOKS = np.array([0.0, 0.13, 0.31, 0.5, 0.67, 0.86, 1.0])
 FITTED = [0, 3, 6]
 BEND = 0.1
-# Steps next to events are short, and what counts as "at the same time" is measured by how long steps have been of late:
-# each step leaves this part of that length.
+# What counts as "at the same time" is measured by how long steps have been of late, because steps next to events are
+# short. Each step leaves this part of that length.
 FORGOTTEN = 0.8
 
 

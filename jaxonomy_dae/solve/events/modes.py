@@ -67,6 +67,7 @@ class Search(NamedTuple):
         improved = last & ~first & (least < self.wrong)
         base = jnp.where(improved | (found & ~first), jnp.where(found, now, best), self.base)
         none_better = last & ~improved
+        # Set 0 flips nothing. After a better base was found it is left out, since that base has been looked at.
         tried = jnp.where(improved, min(1, len(sets) - 1), jnp.where(none_better, 0, self.tried + 1))
         infinite = jnp.full_like(least, jnp.inf)
         on = Search(

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from ...base.tolerances import ridge
 
-# What XLA need not look for in the order of rows.
+# The order of rows is a permutation, so XLA need not look for indices that are out of bounds, negative or equal.
 PERMUTATION: Any = {"mode": "promise_in_bounds", "wrap_negative_indices": False, "unique_indices": True}
 
 

@@ -92,7 +92,7 @@ def _(operator: SparseLinearOperator) -> bool:
     return any(tag in operator.tags for tag in known)
 
 
-# What is not seen from the pattern is what the tags say.
+# The pattern does not show these properties, so that the tags alone tell them.
 for _asked, _tag in (
     (lx.has_unit_diagonal, lx.unit_diagonal_tag),
     (lx.is_positive_semidefinite, lx.positive_semidefinite_tag),

@@ -282,6 +282,8 @@ def _regularised(pattern: SparsePattern, values: Float[Array, " nnz"], nudged: b
         # One factor for all entries would leave a singular matrix singular, so each entry has its own. They are the
         # same in every solve, so that a call has one result.
         values = values * (1 + jnp.asarray(ULPS * np.finfo(np.float64).eps * shift))
+    # Each zero gets a number of its own, because equal ones in two rows of zeros would cancel to a pivot of exactly
+    # zero.
     return jnp.where(values == 0, jnp.asarray(ZERO * (2 + shift)), values)
 
 
@@ -318,6 +320,7 @@ def _on_host(rows: np.ndarray, cols: np.ndarray, values: Any, b: Any) -> Any:
                 continue
         return out.reshape(*batch, n)
 
+    # A batch is one callback, and not one for each member.
     return jax.pure_callback(solved, jax.ShapeDtypeStruct(b.shape, b.dtype), values, b, vmap_method="expand_dims")
 
 
@@ -348,4 +351,5 @@ def compressed(push: Callable[[Any], Any], pattern: SparsePattern, dtype: Any) -
     colors = pattern.colors
     seeds = jnp.zeros((pattern.n_colors, pattern.n), dtype).at[colors, np.arange(pattern.n)].set(1.0)
     products = jax.vmap(push)(seeds)
+    # No other column of the colour has an entry in this row, so the product there is the entry itself.
     return products[colors[pattern.cols], pattern.rows]

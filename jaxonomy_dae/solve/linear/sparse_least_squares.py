@@ -20,8 +20,9 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-# For entries near one. What belongs to singular values above its root, 1e-5, is solved; rounding leaves some eps/δ of
-# the residual in directions that A leaves open, which the repetitions take out of b, not out of x.
+# The δ of matrices with entries near one. What belongs to singular values above its root, 1e-5, is solved. Rounding
+# leaves some eps/δ of the residual in directions that A leaves open, and the repetitions take this out of b, not out of
+# x.
 REGULARIZATION = 1e-10
 SMALLEST = REGULARIZATION**0.5
 REPETITIONS = 3

@@ -94,6 +94,7 @@ def solve_whole(
             return x
         missing, size = residual(x)
         allowed = jnp.maximum(TOLERATED * size, TOLERATED_NORM * np.sqrt(n) * jnp.max(jnp.abs(x)))
+        # Below the second term, products have lost digits to underflow.
         holds = jnp.all(jnp.abs(missing) <= eps * allowed + TOLERATED / eps * tiny)
         if solver is None:
             # Of singular equations that agree, any of many solutions: this one changes with the equations' last digits.
@@ -143,6 +144,7 @@ def _by_lineax(pattern: SparsePattern, values: Any, solver: lx.AbstractLinearSol
         size = jnp.max(jnp.abs(b))
         unit = jnp.where(size > 0, size, 1)
         found = lx.linear_solve(operator.T if transpose else operator, b / unit, solver, throw=False).value
+        # A solve that failed counts as zero: as a correction it leaves the solution as it is.
         return jnp.where(jnp.all(jnp.isfinite(found)), unit * found, 0)
 
     return solve

@@ -17,8 +17,9 @@ from ...base.aliases import Args, PyTree, Result, State, Time, Tolerance
 Determinants = Float[Array, " blocks"]
 
 SINGULAR_CHOICE: Result = diffrax.RESULTS.singular
-# Of the largest determinant so far: the determinant is as near to zero as z is to the branch point, and an error of
-# 1e-8 in x, the default tolerance, is one of 1e-4 in z (see above).
+# A branch point is near where a determinant has fallen to this part of its largest value so far. The determinant is as
+# near to zero as z is to the branch point, and an error of 1e-8 in x, the default tolerance, is one of 1e-4 in z (see
+# above).
 NEAREST = 1e-4
 IN_DOUBT = 30.0  # absolute tolerances: a variable this close to the branch point may have passed it
 REFUSED = 0.5  # of the nearest: a step that goes further is not accepted, so that the end is found from one side

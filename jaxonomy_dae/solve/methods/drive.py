@@ -88,6 +88,7 @@ def integrate(
         stats["num_jacobians"] = stats["num_steps"]
     last = jax.tree.map(lambda v: v[0], (solved.ts["last"], solved.ys["last"]))
     ts, result = jnp.asarray(solved.ts["out"]), solved.result
+    # The end was moved by one rounding, and users compare times with those they asked for.
     if short is not end:
         ts, last = jnp.where(ts == short, end, ts), (jnp.where(last[0] == short, end, last[0]), last[1])
     if fits is not True:

@@ -24,8 +24,9 @@ def not_a_number(x: Float[Array, "n x"], reached: Bool[Array, " n"], *sources: P
     """
     leaves = [leaf for leaf in jax.tree.leaves(sources) if eqx.is_inexact_array(leaf)]
     total = sum((jnp.sum(leaf) for leaf in leaves), jnp.zeros((), x.dtype)).astype(x.dtype)
-    # A linear function of factors that overflow: infinity minus infinity times what is not zero, zero times zero. They
-    # depend on data, so that no compiler multiplies them beforehand.
+    # The function is linear, with factors that overflow. Backwards, a cotangent that is not zero becomes infinity minus
+    # infinity, which is not a number, and one that is zero stays zero. The factors depend on data, so that no compiler
+    # multiplies them beforehand.
     large = jnp.asarray(float(jnp.finfo(x.dtype).max) ** 0.7, x.dtype)
     one = jnp.ones((), x.dtype)
     factor, other = (jnp.where(jnp.all(reached), one, f * large) for f in (1, 2))

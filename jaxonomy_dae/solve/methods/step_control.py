@@ -13,13 +13,14 @@ from ...base.aliases import Args, Numeric, State, Time, Tolerance
 from ..adjoint.ends import End
 
 SAFETY = 0.9  # of the step that would just meet the tolerance (Hairer, Nørsett & Wanner 1993, II.4)
-# In tolerances: the first step is chosen as if everything moved by as much in the problem's own time. Motion below the
-# tolerance, at rest or nearly so, is then resolved, too; its derivatives may be asked for, though no error shows it.
+# The first step is chosen as if everything moved by so many tolerances in the problem's own time. Motion below the
+# tolerance, at rest or nearly so, is then resolved, too: its derivatives may be asked for, though no error shows it.
 UNSEEN = 1e3
-# Spacings of floating-point numbers at t: steps so short make no way, and time itself is known to four digits in them.
+# Steps of so many spacings of floating-point numbers at t make no way, and time itself is known to four digits in them.
 SHORT = 1e4
-# Rejections with no step of ordinary length between them. A jump of 1e6 tolerances inside a step takes 20 of them; at a
-# turning point, beyond which there is no solution, steps of a few spacings are accepted and rejected in turn.
+# A run ends after so many rejections with no step of ordinary length between them. A jump of 1e6 tolerances inside a
+# step takes 20 of them. At a turning point, beyond which there is no solution, steps of a few spacings are accepted and
+# rejected in turn.
 MOST_TRIES = 100
 # Up to so many errors are squared and added one by one: a sum over a short last axis, of each member of a batch, took a
 # tenth of the time of 10,000 rollouts of a pendulum. As many states are traced as scalars (`lowering.gather.SCALARS`).

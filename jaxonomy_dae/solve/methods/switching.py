@@ -21,11 +21,12 @@ STIFF: Result = diffrax.RESULTS.breakdown
 # Nine tenths of the way to the boundary of Tsit5's stability region, which along the negative real axis is at −3.5.
 BOUNDARY = 0.9 * 3.5
 PATIENCE = 15  # limited steps in a row, as in Hairer's DOPRI5: a transient that passes is not stiffness
-# Steps of that size still to be taken: fewer cost less than compiling another solver
-# (test_default_solver.py::test_fast_decay_before_a_short_end_stays_explicit).
+# The solver is changed only if so many steps of the present size are still to be taken: fewer cost less than compiling
+# another solver (test_default_solver.py::test_fast_decay_before_a_short_end_stays_explicit).
 MANY = 2000
-# Of the steps that a run may take, where another solver may not be chosen: while stability limits steps, near a fifth
-# of them are rejected (test_default_solver.py::test_explicit_steps_that_do_not_suffice: 3,735 of 20,894).
+# Where no other solver may be chosen, a run is given up if the steps to its end are more than this part of those that
+# it may take. While stability limits steps, near a fifth of them are rejected
+# (test_default_solver.py::test_explicit_steps_that_do_not_suffice: 3,735 of 20,894).
 SHARE = 0.75
 
 
