@@ -438,8 +438,8 @@ def _delay(*_: Expression) -> Value:
 
 def _clocked(name: str, *_: Expression) -> Value:
     raise ModelError(
-        f"{name}(…) belongs to the synchronous language elements (chapter 16 of the specification), which are not read: "
-        "write sample(start, interval) in a when"
+        f"{name}(…) belongs to the synchronous language elements, chapter 16 of the specification, which are not "
+        "read: write sample(start, interval) in a when"
     )
 
 
