@@ -1,13 +1,14 @@
 """The classes of a Modelica library that have connectors: opened, translated, compiled in a plant of boundaries.
 
-    python -m benchmarks.modelica_classes --library FOLDER [--packages Modelica.Electrical …] [--every N]
-        [--out FILE] [--page FILE]
+    python -m benchmarks.modelica_classes --library FOLDER [--packages Modelica.Electrical …] [--sample SEED]
+        [--classes N] [--out FILE] [--page FILE]
 
 `--library` holds the folder Modelica (a checkout of modelica/ModelicaStandardLibrary, tag v4.1.0; not part of this
 project). Each class is opened by the front end and becomes a component, each port of which meets a boundary whose flow
 is its potential, each input a constant. The plant is compiled, which refuses one whose equations are not as many as its
 unknowns. Parameters without a value are 1. Classes that are partial, and those without connectors, are counted apart.
-`GIVEN` holds what some classes do not have by themselves.
+`GIVEN` holds what some classes do not have by themselves. `--sample` puts the classes in a random order in which any
+number of the first ones has each package in proportion.
 
 Classes run in a process that is replaced when one of them takes too long. Lines of JSON go to `--out`, from where a
 second call goes on; the table by sub-library and the reasons go to `--page`.
@@ -17,6 +18,8 @@ import argparse
 import collections
 import json
 import multiprocessing
+import random
+import re
 import resource
 import sys
 import time
@@ -26,10 +29,11 @@ from pathlib import Path
 from typing import Any
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv
+from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.library.signal import Constant
 from jaxonomy_dae.modelica import Library
 from jaxonomy_dae.modelica.library import component_of
-from jaxonomy_dae.modelica.open_class import OpenClass
+from jaxonomy_dae.modelica.open_class import OpenClass, is_frame
 from jaxonomy_dae.modelica.packing import components_in
 from jaxonomy_dae.modelica.port_domains import domain_of
 from jaxonomy_dae.modelica.sources import Sources
@@ -43,7 +47,19 @@ GIVEN = {  # modifications of classes whose names begin so: the first that fits
     "Modelica.Fluid.Sources.": f"{WATER}, nPorts = 1",
     "Modelica.Fluid.": WATER,
     "Modelica.Mechanics.MultiBody.World": "enableAnimation = false",
+    "Modelica.Blocks.Sources.CombiTimeTable": "table = [0, 1; 1, 2]",
+    "Modelica.Blocks.Sources.TimeTable": "table = [0, 1; 1, 2]",
+    "Modelica.Blocks.Sources.IntegerTable": "table = [0, 1; 1, 2]",
+    "Modelica.Blocks.Sources.BooleanTable": "table = {0.5}",
+    "Modelica.Blocks.Tables.CombiTable2D": "table = [0, 0, 1; 0, 1, 2; 1, 2, 4]",
+    "Modelica.Blocks.Tables.": "table = [0, 1; 1, 2]",
+    "Modelica.Electrical.Analog.Sources.Table": "table = [0, 1; 1, 2]",
+    "Modelica.Blocks.Math.MinMax": "nu = 2",
+    "Modelica.Blocks.MathBoolean.": "nu = 2",
+    "Modelica.Blocks.MathInteger.": "nu = 2",
 }
+# What the front end says where a parameter without a value decides the equations.
+_DECIDES = re.compile(r"not parameter-evaluable: unknown variable: (\w+)|unresolved component dimension for \w+: (\w+)")
 
 
 class Boundaries(Component):
@@ -65,6 +81,12 @@ class Boundaries(Component):
             reached = {b for _, b in of.branches} | set(of.roots)
             if not port.orientation:
                 self.add_equations(*(Eq(f, p) for f, p in zip(through, across, strict=True)))
+            elif not is_frame(port.orientation):
+                free = [p for (n, _), p in zip(domain.across, across, strict=True) if n not in port.orientation]
+                self.add_equations(*(Eq(f, p) for f, p in zip(through, free, strict=True)))
+                if port.name not in reached:
+                    self.declare_root(mine)
+                    self.add_equations(*(Eq(self[f"p{k}.{n}"], 0) for n in port.orientation))
             elif port.name in reached:
                 self.add_equations(
                     *(Eq(f, p) for f, p in zip(through[:3], across[:3], strict=True)),
@@ -80,7 +102,11 @@ class Boundaries(Component):
 
 def main() -> int:
     asked = _arguments()
-    names = [n for p in asked.packages for n in components_in(Sources([asked.library]), p)][:: asked.every]
+    names = [n for p in asked.packages for n in components_in(Sources([asked.library]), p)]
+    all_of_them = len(names)
+    if asked.sample is not None:
+        names = _drawn(names, asked.sample)
+    names = names[: asked.classes]
     done = {r["class"]: r for r in _read(asked.out)}
     left = [n for n in names if n not in done]
     start = time.monotonic()
@@ -91,7 +117,7 @@ def main() -> int:
             with open(asked.out, "a", encoding="utf-8") as out:
                 out.write(json.dumps(row) + "\n")
         left = [n for n in left if n not in done]
-    page = _page([done[n] for n in names if n in done], len(names))
+    page = _page([done[n] for n in names if n in done], all_of_them, asked.sample)
     print(page)
     if asked.page:
         Path(asked.page).write_text(page, encoding="utf-8")
@@ -102,11 +128,29 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.modelica_classes")
     parser.add_argument("--library", required=True)
     parser.add_argument("--packages", nargs="+", default=["Modelica"], help="packages or classes")
-    parser.add_argument("--every", type=int, default=1, help="take each N-th class")
+    parser.add_argument("--sample", type=int, metavar="SEED", help="take the classes in a random order")
+    parser.add_argument("--classes", type=int, help="take so many of them")
     parser.add_argument("--minutes", type=float, default=1e6, help="begin no class after this time")
     parser.add_argument("--out", default="modelica_classes.jsonl")
     parser.add_argument("--page", help="a file for the tables, in Markdown")
     return parser.parse_args()
+
+
+def _drawn(names: Sequence[str], seed: int) -> list[str]:
+    """Classes in a random order; the places of each package are spread evenly."""
+    draw = random.Random(seed)
+    groups: dict[str, list[str]] = collections.defaultdict(list)
+    for name in names:
+        groups[_package(name)].append(name)
+    places = {}
+    for group in groups.values():
+        draw.shuffle(group)
+        places |= {name: (k + draw.random()) / len(group) for k, name in enumerate(group)}
+    return sorted(names, key=lambda n: places[n])
+
+
+def _package(name: str) -> str:
+    return ".".join(name.split(".")[1:3])
 
 
 def _read(file: str) -> list[dict]:
@@ -168,7 +212,7 @@ def row_of(library: Library, name: str) -> dict:
 
 def _stages(library: Library, name: str, row: dict):
     yield "found"
-    found = library.opened(name, next((text for prefix, text in GIVEN.items() if name.startswith(prefix)), ""))
+    found = _opened(library, name, [next((text for prefix, text in GIVEN.items() if name.startswith(prefix)), "")])
     row["connectors"] = len(found.ports) + len(found.inputs) + len(found.outputs)
     yield "opened"
     values: dict[str, Any] = dict.fromkeys(found.required, 1.0)
@@ -176,6 +220,18 @@ def _stages(library: Library, name: str, row: dict):
     yield "translated"
     row |= _compiled(found)
     yield "compiled"
+
+
+def _opened(library: Library, name: str, given: list[str]) -> OpenClass:
+    """A class with what is given, and with 1 for parameters that decide its equations."""
+    try:
+        return library.opened(name, ", ".join(filter(None, given)))
+    except ModelError as error:
+        unknown = _DECIDES.search(str(error))
+        value = f"{unknown[1] or unknown[2]} = 1" if unknown else ""
+        if not value or value in given:
+            raise
+    return _opened(library, name, [*given, value])
 
 
 def _compiled(of: OpenClass) -> dict:
@@ -197,15 +253,17 @@ def _compiled(of: OpenClass) -> dict:
     return {"states": len(system.states)}
 
 
-def _page(rows: list[dict], all_of_them: int) -> str:
+def _page(rows: list[dict], all_of_them: int, seed: int | None) -> str:
     partial = [r for r in rows if "is partial" in r.get("why", "")]
     bare = [r for r in rows if r.get("connectors") == 0]
     rows = [r for r in rows if r not in partial and r not in bare]
     of: dict[str, list[dict]] = collections.defaultdict(list)
     for row in rows:
-        of[".".join(row["class"].split(".")[1:3])].append(row)
+        of[_package(row["class"])].append(row)
     lines = [
-        f"{len(partial)} partial, {len(bare)} without connectors; of {all_of_them}",
+        f"{len(rows) + len(partial) + len(bare)} classes of {all_of_them}"
+        + (f", drawn with the seed {seed}" if seed is not None else "")
+        + f"; {len(partial)} of them are partial and {len(bare)} have no connectors.",
         "",
         "| package | classes | opened | translated | compiled |",
         "|---|---|---|---|---|",

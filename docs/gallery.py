@@ -54,6 +54,7 @@ LEVELS: dict[str, tuple[Entry, ...]] = {
         Entry("battery_pack", "Arrays of cells with heat; which cell is bad?", "40 seconds"),
         Entry("house", "Identify, control and design a house by one model.", "60 seconds"),
         Entry("modelica", "Models read from Modelica: gradients, a fit, a thousand runs.", "40 seconds"),
+        Entry("out_and_back", "A learned model as an FMU: run, tuned and taken back in.", "40 seconds"),
         Entry("next_experiment", "Which experiment tells most, before it is made.", "30 seconds"),
     ),
     "Measured data": (

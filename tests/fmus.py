@@ -21,13 +21,15 @@ class Opened:
     """An instance of an FMU, after initialization, in event mode."""
 
     def __init__(self, path: Path, starts: dict[str, float] | None = None, t0: float = 0.0, initialize: bool = True):
+        from fmpy.fmi2 import FMU2Model
         from fmpy.fmi3 import FMU3Model
 
         self.description = fmpy.read_model_description(str(path))
+        self.version = int(float(self.description.fmiVersion))
         self.messages: list[str] = []
         self._folder = fmpy.extract(str(path))
         self.reference = {v.name: v.valueReference for v in self.description.modelVariables}
-        self.model: Any = FMU3Model(
+        self.model: Any = (FMU3Model if self.version == 3 else FMU2Model)(
             guid=self.description.guid,
             unzipDirectory=self._folder,
             modelIdentifier=self.description.modelExchange.modelIdentifier,
@@ -36,7 +38,11 @@ class Opened:
         self.model.instantiate(loggingOn=True)
         self.set(starts or {})
         if initialize:
-            self.model.enterInitializationMode(startTime=t0)
+            if self.version == 2:
+                self.model.setupExperiment(startTime=t0)
+                self.model.enterInitializationMode()
+            else:
+                self.model.enterInitializationMode(startTime=t0)
             self.model.exitInitializationMode()
             self.update()
 
@@ -45,21 +51,25 @@ class Opened:
 
     def set(self, values: dict[str, float]) -> None:
         if values:
-            self.model.setFloat64(self.references(list(values)), [float(v) for v in values.values()])
+            to = self.model.setFloat64 if self.version == 3 else self.model.setReal
+            to(self.references(list(values)), [float(v) for v in values.values()])
 
     def get(self, *names: str) -> np.ndarray:
-        return np.array(self.model.getFloat64(self.references(names)))
+        of = self.model.getFloat64 if self.version == 3 else self.model.getReal
+        return np.array(of(self.references(names)))
 
     def update(self) -> tuple:
-        found = self.model.updateDiscreteStates()
+        update = self.model.updateDiscreteStates if self.version == 3 else self.model.newDiscreteStates
+        found = update()
         while found[0]:
-            found = self.model.updateDiscreteStates()
+            found = update()
         return found
 
     def forward(self, unknowns: Sequence[str], knowns: Sequence[str], seed: Any) -> np.ndarray:
+        sizes = [len(unknowns)] if self.version == 3 else []
         return np.array(
             self.model.getDirectionalDerivative(
-                self.references(unknowns), self.references(knowns), list(map(float, seed)), len(unknowns)
+                self.references(unknowns), self.references(knowns), list(map(float, seed)), *sizes
             )
         )
 
@@ -151,7 +161,7 @@ def point(system, fmu, outputs):
 
 
 def check_derivatives(system, path, outputs, seed=0, rtol=1e-10):
-    """Both derivatives are those of JAX, and each other's transposes."""
+    """Both derivatives are those of JAX, and each other's transposes; only the first in FMI 2.0."""
     rng = np.random.default_rng(seed)
     with opened(path) as fmu:
         unknowns, knowns, values, function = point(system, fmu, outputs)
@@ -164,6 +174,8 @@ def check_derivatives(system, path, outputs, seed=0, rtol=1e-10):
         forward = fmu.forward(unknowns, knowns, flat)
         scale = max(np.abs(slope).max(), 1e-300)
         np.testing.assert_allclose(forward / scale, slope / scale, atol=rtol)
+        if fmu.version == 2:  # which has no adjoint derivatives
+            return
         reverse = fmu.reverse(unknowns, knowns, weight, len(flat))
         expected = np.concatenate([np.ravel(b) for b in back])
         scale = max(np.abs(expected).max(), 1e-300)

@@ -18,7 +18,7 @@ OWN = (
     "idle",
     "invariance",
 )  # they say themselves what is right, by `judged(seed)`
-FAMILIES = (*NETWORKS, "events", *SWITCHING, "gradients", *OWN)
+FAMILIES = (*NETWORKS, "events", "beside", "flat", *SWITCHING, "gradients", *OWN)
 UNITS = ("equations", "parameters", "units", "all")  # what is rescaled: `benchmarks/rescaling.py`
 PUBLISHED = "published"  # problems that are their own references, in other units
 

@@ -10,16 +10,31 @@ from sympy import Piecewise, Symbol
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, assign, der, pre, reinit
 
 from .case import Case, Motion, names
-from .hybrid import AMPLIFIED, APART, Clock, Delicate, HybridSystem, Reading, Reference, Rule, T
+from .hybrid import AMPLIFIED, APART, USUAL, Clock, Delicate, HybridSystem, Limits, Reading, Reference, Rule, T
 
 ALLOWED = 1e-6  # of a variable's size
 NUDGE = 1e-6  # of the starts, to see what it grows to
 
 
+class Style:
+    """How readings and guards are written: as they are."""
+
+    def reading(self, component: Component, y: Symbol, cubic, right) -> list:
+        """The equations 0 = … of a reading y + cubic·y³ = right."""
+        return [(y + cubic * y**3 if cubic else y) - right]
+
+    def guard(self, guard, rng: np.random.Generator):
+        """An expression of the same sign."""
+        return guard
+
+
+PLAIN = Style()
+
+
 class Written(Component):
     """A hybrid system in the words of the package; some of its numbers are parameters."""
 
-    def __init__(self, ev: EqnEnv, name: str, system: HybridSystem, rng: np.random.Generator):
+    def __init__(self, ev: EqnEnv, name: str, system: HybridSystem, rng: np.random.Generator, style: Style = PLAIN):
         super().__init__(ev, name)
         now: dict = {T: ev.t}
         for x, start in system.states.items():
@@ -48,8 +63,8 @@ class Written(Component):
             now[r] = before[r] = Piecewise((1.0, relation), (0.0, True))
         equations = [der(now[x]) - told(rate, now) for x, rate in system.rates.items()]
         for y, reading in system.readings.items():
-            left = now[y] + told(reading.cubic, now) * now[y] ** 3 if reading.cubic else now[y]
-            equations.append(left - told(reading.right, now))
+            cubic = told(reading.cubic, now) if reading.cubic else 0
+            equations += style.reading(self, now[y], cubic, told(reading.right, now))
         self.add_equations(*(equations[k] for k in rng.permutation(len(equations))))
 
         def actions(writes):
@@ -58,7 +73,7 @@ class Written(Component):
                 yield act(now[target], told(value, before))
 
         for rule in (system.rules[k] for k in rng.permutation(len(system.rules))):
-            guard = told(rule.guard, now)
+            guard = style.guard(told(rule.guard, now), rng)
             condition = (guard <= 0, guard < 0, -guard >= 0, -guard > 0)[int(rng.integers(4))]
             if rule.mode is None:
                 self.when(condition, *actions(rule.writes))
@@ -96,6 +111,9 @@ class Draft:
         q = Symbol(self.label())
         self.discretes[q] = start
         return q
+
+    def began(self) -> None:
+        """Called once there are states, before any event."""
 
     def any(self, symbols) -> Symbol:
         symbols = list(symbols)
@@ -203,11 +221,12 @@ def _mode(d: Draft):
 FEATURES = (_thermostat, _fire, _bounce, _clock, _relation, _timed, _mode)
 
 
-def _draw(rng: np.random.Generator) -> tuple[HybridSystem, float]:
+def drawn(rng: np.random.Generator, draft: type[Draft] = Draft) -> tuple[HybridSystem, float]:
     """A system with one to four events, and how long it runs."""
     label = iter(names(rng, 40))
-    d = Draft(rng, round(float(rng.uniform(2, 6)), 3), lambda: next(label))
+    d = draft(rng, round(float(rng.uniform(2, 6)), 3), lambda: next(label))
     _base(d)
+    d.began()
     for k in rng.permutation(len(FEATURES))[: int(rng.integers(1, 4))]:
         FEATURES[k](d)
     for _ in range(int(rng.integers(0, 2))):
@@ -220,17 +239,20 @@ def make(seed: int) -> Case:
     """One to seven states with events; what two methods need not agree about is drawn again."""
     rng = np.random.default_rng([seed, 10])
     while True:
-        system, end = _draw(rng)
+        system, end = drawn(rng)
         if not 1 <= len(system.rules) + len(system.clocks) + len(system.relations) <= 4:
             continue
         try:
-            return _case(rng, system, end)
+            return case_of(rng, system, end)
         except Delicate:
             continue
 
 
-def _case(rng: np.random.Generator, system: HybridSystem, end: float) -> Case:
-    reference = Reference(system)
+def case_of(
+    rng: np.random.Generator, system: HybridSystem, end: float, style: Style = PLAIN, limits: Limits = USUAL
+) -> Case:
+    """What a system does up to `end`. Raises `Delicate`."""
+    reference = Reference(system, limits)
     run = reference.run(end)
     if len(run.instants) < 2:
         raise Delicate("nothing happens")
@@ -248,7 +270,7 @@ def _case(rng: np.random.Generator, system: HybridSystem, end: float) -> Case:
     if not grown <= AMPLIFIED:
         raise Delicate("chaotic")
     ev = EqnEnv()
-    part = Written(ev, "sys", system, rng)
+    part = Written(ev, "sys", system, rng, style)
     motion = Motion(
         ts,
         {f"sys.{s}": v for s, v in values.items()},

@@ -22,12 +22,23 @@ TIGHT = dict(method="DOP853", rtol=1e-11, atol=1e-13)
 
 # Of the run's duration, with states, conditions and rates of size one.
 APART = 0.01  # between two instants
-CROSSING = 0.05  # a condition's rate, at least
-NEAR = 1e-3  # a condition that comes so close and turns back may have been reached
 MOST = 40  # instants
 LARGE = 1e3  # a state
 EVALUATIONS = 3_000  # of the rates between two instants
 AMPLIFIED = 100.0  # what a change of the starts may grow by
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """What counts as delicate: a condition that is crossed at a rate below `crossing`, or that comes as `near` to zero
+    and turns back, as seen at so many `looks` between two instants."""
+
+    crossing: float = 0.05
+    near: float = 1e-3
+    looks: int = 60
+
+
+USUAL = Limits()
 
 
 class Delicate(ArithmeticError):
@@ -91,8 +102,8 @@ class Run:
 class Reference:
     """A hybrid system as functions of NumPy arrays."""
 
-    def __init__(self, system: HybridSystem):
-        self.system = system
+    def __init__(self, system: HybridSystem, limits: Limits = USUAL):
+        self.system, self.limits = system, limits
         self.solved = {y: reading.solved() for y, reading in system.readings.items()}
         states, rates = list(system.states), [self._explicit(system.rates[x]) for x in system.states]
         # Conditions: those of the rules, that fall when they become true, and those of the relations.
@@ -125,7 +136,7 @@ class Reference:
         r = np.zeros(len(system.relations))
         for _ in range(len(r) + 1):  # a relation may compare what another one chooses
             values = np.array(self.guards(t, x, q, r))
-            if np.any(np.abs(values) < NEAR):
+            if np.any(np.abs(values) < self.limits.near):
                 raise Delicate("a condition is zero at the start")
             before, r = r, (values[rules:] > 0).astype(float)
             if np.array_equal(before, r):
@@ -184,16 +195,16 @@ class Reference:
 
         solution = scipy.integrate.solve_ivp(
             rates, (t, stop), x, events=[e for _, e in watched], dense_output=True,
-            max_step=max((stop - t) / 5, 1e-3), **TIGHT,
+            max_step=max((stop - t) * 12 / self.limits.looks, 1e-3), **TIGHT,
         )  # fmt: skip
         if solution.status < 0 or not np.all(np.abs(solution.y[:, -1]) < 1e2):
             raise Delicate("it grows without bounds")
         hits = [k for (k, _), found in zip(watched, solution.t_events, strict=True) if len(found)]
-        times = np.linspace(t, solution.t[-1], 60)
+        times = np.linspace(t, solution.t[-1], self.limits.looks)
         looks = np.array([self.guards(s, solution.sol(s), q, r) for s in times])
         for k, _ in watched:
             size = np.abs(looks[:, k])
-            turns = (size[1:-1] < size[:-2]) & (size[1:-1] < size[2:]) & (size[1:-1] < NEAR)
+            turns = (size[1:-1] < size[:-2]) & (size[1:-1] < size[2:]) & (size[1:-1] < self.limits.near)
             changes = np.sum(np.diff(np.sign(looks[2:-1, k])) != 0)
             if turns.any() or changes:
                 raise Delicate(f"condition {k} is grazed")
@@ -211,7 +222,7 @@ class Reference:
     def _settled(self, t, x, q, r, holds, crossed):
         """What follows at this instant, one event after another, beginning with the condition that has `crossed`."""
         rules = len(self.system.rules)
-        if crossed is not None and abs(self.slopes(t, x, q, r)[crossed]) < CROSSING:
+        if crossed is not None and abs(self.slopes(t, x, q, r)[crossed]) < self.limits.crossing:
             raise Delicate(f"condition {crossed} is hardly crossed")
         fired = None
         if crossed is not None and crossed >= rules:
@@ -224,9 +235,9 @@ class Reference:
                 x, q = self._fired(fired, t, x, q, r)
             values, slopes = (np.array(f(t, x, q, r)) for f in (self.guards, self.slopes))
             above = values[rules:] > 0
-            for k in np.flatnonzero(np.abs(values) < NEAR):
+            for k in np.flatnonzero(np.abs(values) < self.limits.near):
                 # Only the one that has crossed may be at zero: what it does next decides.
-                if k != crossed or abs(values[k]) > 1e-8 or abs(slopes[k]) < CROSSING:
+                if k != crossed or abs(values[k]) > 1e-8 or abs(slopes[k]) < self.limits.crossing:
                     raise Delicate(f"condition {k} is zero beside another")
                 values[k] = slopes[k]
                 if k >= rules:

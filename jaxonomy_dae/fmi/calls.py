@@ -398,6 +398,7 @@ def _differentiable(
         (given,), (tangent,) = primals, tangents
         at, n = lax.stop_gradient(given), len(given)
         tangent = first_only(given) * tangent
+        # `custom_linear_solve` is for square systems, so arguments and results are filled up to one length.
         size = max(m, n)
 
         def padded(a: Array, used: int) -> Array:

@@ -19,6 +19,8 @@ TARGETS = {
     "x86_64-darwin": ("x86_64-macos", ".dylib"),
     "aarch64-darwin": ("aarch64-macos", ".dylib"),
 }
+# Folders of binaries in FMI 2.0, which knows fewer platforms.
+FOLDERS_OF_FMI_2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
 # Never -ffast-math: it removes tests for not-a-number and moves events. Without contraction to multiply-add, all
 # platforms compute the same numbers.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-fPIC", "-shared")

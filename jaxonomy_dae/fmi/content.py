@@ -35,6 +35,9 @@ class Content:
         self.layout = Layout.of(self.programs)
         own_names = set(map(structured, states))
         self.slope_names = [_name_of_slope(name, own_names) for name in states]
+        n = self.programs.n_opened
+        self.opened_names = [f"dae.slope[{k + 1}]" for k in range(len(states) * bool(n))]
+        self.opened_names += [f"dae.residual[{k + 1}]" for k in range(n - len(self.opened_names))]
         self.guard_names = [f"events.guard[{k + 1}]" for k in range(self.programs.ng)]
 
     def _outputs(self, outputs: Sequence[str] | None) -> list[str]:
@@ -82,7 +85,7 @@ class Content:
         """The texts of messages."""
         plan = self.plan
         return {
-            "unknowns": [*self.slope_names, *map(structured, self.outputs), *self.guard_names],
+            "unknowns": [*self.slope_names, *map(structured, self.outputs), *self.guard_names, *self.opened_names],
             "rows": _rows_of_start(plan, self.programs.starts),
             "carried": self.system.carried,
             "events": () if plan.events is None else plan.events.names,

@@ -163,14 +163,14 @@ def _of_operation(
                 total = total + rows[np.broadcast_to(own, kinds[0].shape).ravel()]
         return [total]
     if name in MOVES:
-        moved = _moved(program, operation, value)
-        if moved is not None:
+        places = moved(program, operation, value)
+        if places is not None:
             every: Rows = sp.vstack(
                 [sp.csr_array((1, n), dtype=bool)]
                 + [_whole(r, program.kind(a).size, n) for a, r in zip(operation.given, read, strict=True)],
                 format="csr",
             )
-            return [sp.csr_array(every[np.maximum(ids, 0).ravel()]) for ids in moved]
+            return [sp.csr_array(every[np.maximum(ids, 0).ravel()]) for ids in places]
     if name in REDUCES and read[0] is not None:
         shape, axes = program.kind(operation.given[0]).shape, tuple(operation.params["axes"])
         places = np.moveaxis(np.arange(read[0].shape[0]).reshape(shape), axes, range(-len(axes), 0))
@@ -187,7 +187,7 @@ def _of_operation(
     return [sp.csr_array(row[np.zeros(kind.size, int)]) for kind in kinds]
 
 
-def _moved(
+def moved(
     program: Straight, operation: Operation, value: Callable[[Atom], np.ndarray | None]
 ) -> list[np.ndarray] | None:
     """For each result, the entries that it is made of: places among all entries that are read, from 1, 0 for none.
@@ -211,5 +211,5 @@ def _moved(
         params = {**params, "fill_value": 0}
     # The operation itself is run, on the numbers of entries: so no rule for gathers, pads and slices stands here a
     # second time.
-    moved = operation.source_primitive.bind(*ids, **params)
-    return [np.asarray(m) for m in (moved if operation.source_primitive.multiple_results else [moved])]
+    found = operation.source_primitive.bind(*ids, **params)
+    return [np.asarray(m) for m in (found if operation.source_primitive.multiple_results else [found])]

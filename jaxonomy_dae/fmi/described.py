@@ -12,10 +12,8 @@ import numpy as np
 
 from ..base.errors import ModelError
 from ..base.optional import optional_module
-from .compilers import this_platform
+from .compilers import FOLDERS_OF_FMI_2, this_platform
 
-# Folders of binaries in FMI 2.0, for the platforms as FMI 3.0 names them.
-FOLDERS_OF_FMI_2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
 REALS, TRUTHS = ("Float64", "Real"), ("Boolean",)
 WHOLE = ("Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Integer", "Enumeration")
 

@@ -16,6 +16,7 @@ from ..graph.units.unit import Unit, rate
 from .model_c import CVariable
 
 STRUCTURED = re.compile(r"[A-Za-z_]\w*(\[\d+(,\d+)*\])?(\.[A-Za-z_]\w*(\[\d+(,\d+)*\])?)*", re.ASCII)
+LOG_CATEGORIES = '  <LogCategories><Category name="logStatusError"/><Category name="logStatusDiscard"/></LogCategories>'
 SI_IN_XML = ("kg", "m", "s", "A", "K", "mol", "cd")  # the order of the standard's schema
 
 
@@ -35,6 +36,7 @@ class Variable:
     nominal: float = 0.0
     derivative: int | None = None
     reinit: bool = False
+    shape: tuple[int, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,9 +94,9 @@ def model_description(
         'generationTool="jaxonomy_dae" variableNamingConvention="structured">',
         f"  <ModelExchange {abilities}" + ' needsCompletedIntegratorStep="true"' * completed + "/>",
         *([f'  <CoSimulation {abilities} canHandleVariableCommunicationStepSize="true"/>'] if co_simulation else []),
-        *_units(variables),
-        '  <LogCategories><Category name="logStatusError"/><Category name="logStatusDiscard"/></LogCategories>',
-        f'  <DefaultExperiment startTime="0" stopTime="{_number(stop)}" tolerance="{_number(tolerance)}"/>',
+        *unit_definitions(variables),
+        LOG_CATEGORIES,
+        f'  <DefaultExperiment startTime="0" stopTime="{in_xml(stop)}" tolerance="{in_xml(tolerance)}"/>',
         "  <ModelVariables>",
         *(line for k, variable in enumerate(variables) for line in _variable(k, variable)),
         "  </ModelVariables>",
@@ -110,11 +112,13 @@ def model_description(
     return "\n".join([*lines, "  </ModelStructure>", "</fmiModelDescription>", ""])
 
 
-def _number(x: float) -> str:
+def in_xml(x: float) -> str:
+    """A number in XML."""
     return str(float(x))
 
 
-def _units(variables: Sequence[Variable]) -> list[str]:
+def unit_definitions(variables: Sequence[Variable]) -> list[str]:
+    """The lines of all units that variables have."""
     texts = dict.fromkeys(v.unit for v in variables if v.unit)
     if not texts:
         return []
@@ -136,33 +140,41 @@ def _base_unit(unit: Unit, text: str) -> str:
     if text in ("rad", "rad/s"):  # angles are numbers to `units`, and a unit of their own to the standard
         exponents = exponents | {"rad": Fraction(1)}
     parts = [f'{name}="{int(exponents[name])}"' for name in (*SI_IN_XML, "rad") if exponents.get(name)]
-    parts += [f'factor="{_number(unit.scale)}"'] if unit.scale != 1.0 else []
-    parts += [f'offset="{_number(unit.zero)}"'] if unit.zero else []
+    parts += [f'factor="{in_xml(unit.scale)}"'] if unit.scale != 1.0 else []
+    parts += [f'offset="{in_xml(unit.zero)}"'] if unit.zero else []
     return f"<BaseUnit {' '.join(parts)}/>" if parts else "<BaseUnit/>"
 
 
-def _variable(place: int, v: Variable) -> list[str]:
+def of_variable(place: int, v: Variable) -> list[str]:
+    """The attributes of a variable that say what it is."""
     attributes = [
         f"name={quoteattr(v.name)}", f'valueReference="{place}"', f'causality="{v.causality}"',
         f'variability="{v.variability}"',
     ]  # fmt: skip
     if v.description:
         attributes.append(f"description={quoteattr(v.description)}")
-    if v.unit:
-        attributes.append(f"unit={quoteattr(v.unit)}")
     if v.initial:
         attributes.append(f'initial="{v.initial}"')
+    return attributes
+
+
+def of_number(v: Variable, first: int) -> list[str]:
+    """The attributes of a variable's values. `first` is the number of the first variable."""
+    attributes = [f"unit={quoteattr(v.unit)}"] if v.unit else []
     if v.nominal > 0 and v.nominal != 1.0:
-        attributes.append(f'nominal="{_number(v.nominal)}"')
-    attributes += [f'{end}="{_number(x)}"' for end, x in (("min", v.c.low), ("max", v.c.high)) if math.isfinite(x)]
+        attributes.append(f'nominal="{in_xml(v.nominal)}"')
+    attributes += [f'{end}="{in_xml(x)}"' for end, x in (("min", v.c.low), ("max", v.c.high)) if math.isfinite(x)]
     if v.derivative is not None:
-        attributes.append(f'derivative="{v.derivative}"')
+        attributes.append(f'derivative="{v.derivative + first}"')
     if v.reinit:
         attributes.append('reinit="true"')
-    shape = () if v.start is None else np.shape(v.start)
     if v.start is not None:
-        attributes.append(f'start="{" ".join(map(_number, np.ravel(v.start)))}"')
-    head = f"    <Float64 {' '.join(attributes)}"
-    if not shape:
+        attributes.append(f'start="{" ".join(map(in_xml, np.ravel(v.start)))}"')
+    return attributes
+
+
+def _variable(place: int, v: Variable) -> list[str]:
+    head = f"    <Float64 {' '.join([*of_variable(place, v), *of_number(v, 0)])}"
+    if not v.shape:
         return [f"{head}/>"]
-    return [f"{head}>" + "".join(f'<Dimension start="{n}"/>' for n in shape) + "</Float64>"]
+    return [f"{head}>" + "".join(f'<Dimension start="{n}"/>' for n in v.shape) + "</Float64>"]

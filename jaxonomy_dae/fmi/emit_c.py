@@ -242,7 +242,8 @@ class Body:
         self._declared[name] = 2
         if kind.size <= SHORT and self.local + size <= LOCAL:
             self.local += size
-            self.line(f"{c_type(kind.dtype)} {name}[{max(kind.size, 1)}];")
+            # Nothing is written into an array without entries, and compilers warn of reading one.
+            self.line(f"{c_type(kind.dtype)} {name}[{max(kind.size, 1)}]{'' if kind.size else ' = {0}'};")
             return
         size = -(-size // ALIGNED) * ALIGNED
         offset = self._room(size)

@@ -7,7 +7,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from ..base.errors import ModelError
-from .compilers import TARGETS, compiler_for, shared_library, this_platform
+from .compilers import FOLDERS_OF_FMI_2, TARGETS, compiler_for, shared_library, this_platform
 from .export import zipped
 
 
@@ -16,8 +16,7 @@ def add_binaries(path: Path, platforms: Sequence[str] = ()) -> list[str]:
 
     **Arguments:**
 
-    - `path`: an FMU of FMI 3.0 whose build needs one C file, its neighbours, and no settings, as `export_fmu`
-        writes it.
+    - `path`: an FMU whose build needs one C file, its neighbours, and no settings, as `export_fmu` writes it.
     - `platforms`: as `"x86_64-windows"`; none: this machine's.
 
     **Returns:**
@@ -38,7 +37,7 @@ def add_binaries(path: Path, platforms: Sequence[str] = ()) -> list[str]:
             contents = {name: file.read(name) for name in file.namelist() if not name.endswith("/")}
     except (zipfile.BadZipFile, zlib.error) as error:
         raise ModelError(f"'{path}' is damaged: {error}") from None
-    identifier, source = _build(path, contents)
+    version, identifier, source = _build(path, contents)
     try:
         files = {n.removeprefix("sources/"): t.decode() for n, t in contents.items() if _beside_source(n)}
     except UnicodeDecodeError:
@@ -49,7 +48,8 @@ def add_binaries(path: Path, platforms: Sequence[str] = ()) -> list[str]:
         if command is None:
             raise ModelError(f"there is no C compiler for {platform} on this machine: install one, or the extra fmi")
         ending = TARGETS.get(platform, ("", ".so"))[1]
-        added[f"binaries/{platform}/{identifier}{ending}"] = shared_library(command, platform, files, source)
+        folder = platform if version == 3 else FOLDERS_OF_FMI_2.get(platform, platform)
+        added[f"binaries/{folder}/{identifier}{ending}"] = shared_library(command, platform, files, source)
     path.write_bytes(zipped(contents | added))
     return list(added)
 
@@ -58,22 +58,39 @@ def _beside_source(name: str) -> bool:
     return name.startswith("sources/") and name.count("/") == 1 and name.endswith((".c", ".h"))
 
 
-def _build(path: Path, contents: dict[str, bytes]) -> tuple[str, str]:
-    """The identifier of the model and the C file to compile."""
-    description = contents.get("sources/buildDescription.xml")
-    if description is None:
-        raise ModelError(f"'{path}' has no sources/buildDescription.xml: export it with its sources, for FMI 3.0")
-    try:
-        root = ElementTree.fromstring(description)
-    except ElementTree.ParseError as error:
-        raise ModelError(f"'{path}': sources/buildDescription.xml is not XML: {error}") from None
+def _build(path: Path, contents: dict[str, bytes]) -> tuple[int, str, str]:
+    """The version of FMI, the identifier of the model, and the C file to compile."""
+    root = _xml(path, contents, "modelDescription.xml")
+    if root is not None and root.get("fmiVersion", "").startswith("2."):
+        version, configurations = 2, [e for e in root if e.find("SourceFiles") is not None][:1]
+        sources = [e.get("name", "") for one in configurations for e in one.iter("File")]
+        return version, *_checked(path, contents, configurations, sources, 0)
+    root = _xml(path, contents, "sources/buildDescription.xml")
+    if root is None:
+        raise ModelError(f"'{path}' has no sources/buildDescription.xml: export it with its sources")
     configurations = root.findall("BuildConfiguration")
     settings = [e.tag for e in root.iter() if e.tag in ("PreprocessorDefinition", "IncludeDirectory")]
     sources = [e.get("name", "") for e in root.iter("SourceFile")]
+    return 3, *_checked(path, contents, configurations, sources, len(settings))
+
+
+def _xml(path: Path, contents: dict[str, bytes], name: str) -> ElementTree.Element | None:
+    """A file's XML, if there is one."""
+    try:
+        return ElementTree.fromstring(contents[name]) if name in contents else None
+    except ElementTree.ParseError as error:
+        raise ModelError(f"'{path}': {name} is not XML: {error}") from None
+
+
+def _checked(
+    path: Path, contents: dict[str, bytes], configurations: Sequence[ElementTree.Element], sources: Sequence[str],
+    settings: int,
+) -> tuple[str, str]:  # fmt: skip
+    """The identifier and the file of a build."""
     if len(configurations) != 1 or len(sources) != 1 or settings:
         raise ModelError(
             f"'{path}': its build has {len(configurations)} configurations, {len(sources)} source files and "
-            f"{len(settings)} settings; only one configuration with one file and no settings is compiled here"
+            f"{settings} settings; only one configuration with one file and no settings is compiled here"
         )
     identifier, source = configurations[0].get("modelIdentifier", ""), sources[0]
     if not (identifier.isascii() and identifier.isidentifier()):

@@ -53,12 +53,13 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True)
 class CVariable:
-    """A variable as the C code sees it; see `fmi3.c`."""
+    """A variable as the C code sees it; see `instance.c`."""
 
     kind: str
     settable: str
     place: int
     size: int
+    step: int
     start: int
     known: bool
     low: float
@@ -81,7 +82,7 @@ def _table(declaration: str, entries: Sequence[str]) -> str:
 
 
 # The sizes of a model and the switches of its functions, for `run.c`.
-HAS = ("forward", "event", "step")
+HAS = ("forward", "reverse", "event", "step", "opened")
 OF_TEXTS = {"unknowns": "field", "rows": "start", "carried": "event", "events": "event"}  # what has these messages
 
 
@@ -89,6 +90,7 @@ def sizes_of(programs: Programs, layout: Layout, names: dict[str, Sequence[str]]
     """The numbers of `model.h` by name."""
     return {
         "NX": programs.nx, "NZ": programs.nz, "NY": programs.ny, "NG": programs.ng, "NC": programs.nc,
+        "N_UNKNOWNS": programs.n_unknowns,
         "ND": layout.size, "N_ROWS": len(names["rows"]), "N_EVENTS": len(names["events"]), "WORK": work,
         **{f"HAS_{name.upper()}": int(name in programs.names) for name in HAS},
         "LOOKS": LOOKS, "ENDED_AT": 2, "STUCK_AT": 3, "AT_T": layout["t"], "AT_X": layout["x"], "AT_Z": layout["z"],
@@ -145,8 +147,8 @@ def fixed(name: str) -> str:
 def table_of_variables(variables: Sequence[CVariable]) -> str:
     """`variables.c`: what an importer sees."""
     rows = [
-        f"{{{v.kind}, {v.settable}, {v.place}, {v.size}, {v.start}, {int(v.known)}, {number(v.low, np.float64)}, "
-        f"{number(v.high, np.float64)}, {text(v.name)}}}"
+        f"{{{v.kind}, {v.settable}, {v.place}, {v.size}, {v.step}, {v.start}, {int(v.known)}, "
+        f"{number(v.low, np.float64)}, {number(v.high, np.float64)}, {text(v.name)}}}"
         for v in variables
     ]
     return f"#define N_VARIABLES {len(variables)}\n\n" + _table("Variable VARIABLES", rows)

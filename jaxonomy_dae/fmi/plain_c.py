@@ -120,7 +120,7 @@ def _files(
 
 def _header(content: Content, sizes: dict[str, int], functions: Sequence[str]) -> str:
     layout, programs = content.layout, content.programs
-    numbers = {name: sizes[name] for name in ("NX", "NY", "NG", "ND", "WORK")}
+    numbers = {name: sizes[name] for name in ("NX", "NY", "NG", "N_UNKNOWNS", "ND", "WORK")}
     numbers |= {"NQ": len(content.discretes), "NU": len(content.plan.inputs.names), "NP": len(programs.p)}
     places = {f"AT_{name.upper()}": place for name, (place, _) in layout.places.items() if name in "txqpu"}
     struct = fixed("run.h")
@@ -168,7 +168,7 @@ def _source(content: Content, files: dict[str, str]) -> str:
     return "\n".join(
         [
             '#include "plant.h"\n\ntypedef plant_state State;\ntypedef plant Model;\n'
-            "\n#define ROOM(n) PLANT_ROOM(n)\n#define N_UNKNOWNS PLANT_N_UNKNOWNS\n#define NOMINALS plant_nominals\n",
+            "\n#define ROOM(n) PLANT_ROOM(n)\n#define NOMINALS plant_nominals\n",
             files["model.h"],
             files["model.c"].replace("static const double NOMINALS", "const double NOMINALS"),
             files["run.c"],

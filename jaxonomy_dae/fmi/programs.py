@@ -5,8 +5,10 @@ blocks, discrete values, parameters, inputs, and the arrays of networks. `Progra
 (`jax.make_jaxpr`):
 
 - `field`, `outputs`, `guards`: dx/dt, the variables that are read, and the guards of conditions.
-- `forward`, `reverse`: the directional and the adjoint derivative of these three, one after another, by (t, x, p, u,
-  *weights). Nonlinear blocks are differentiated by the implicit function theorem.
+- `unsolved`: the same, with the residuals of nonlinear blocks in place of their solution.
+- `opened`: dx/dt and residuals where unknowns of blocks are given, the last array of `weights` then (`open_blocks`).
+- `forward`, `reverse`: the directional and the adjoint derivative of `field`, `outputs`, `guards` and `opened`, one
+  after another, by (t, x, p, u, *weights). Nonlinear blocks are differentiated by the implicit function theorem.
 - `start`: the consistent point at the initial time, after the events that happen there.
 - `event`: what happens at an instant, by the map that a run uses.
 - `step`: a step of Rodas5P, with its error and its dense output, for Co-Simulation.
@@ -43,6 +45,7 @@ from ..solve.events.solver import MOVED
 from ..solve.events.start import start
 from ..solve.methods.rodas5p import Rodas5P
 from ..write.events import EventFlag
+from .open_blocks import given_quantities, opened, residual_equations
 
 PROJECTIONS = 4  # Gauss–Newton steps onto the constraints, as many as leave rounding of any drift that is tolerated
 RUN = 6  # numbers of a run in `HybridState.of_run`
@@ -70,18 +73,22 @@ class Programs:
         self._quantity = self.plan.resolve(outputs) if outputs else (np.zeros(0, np.int64), np.zeros(0))
         self.ny = len(outputs)
         found, self._tree = jax.tree_util.tree_flatten_with_path(eqx.filter(system.neural, eqx.is_inexact_array))
-        self.weights = tuple(Weights(_name_of_leaf(path), np.asarray(leaf)) for path, leaf in found)
+        self.networks = tuple(Weights(_name_of_leaf(path), np.asarray(leaf)) for path, leaf in found)
+        given = (Weights("dae.algebraic", _given_at_start(system)),) if "opened" in self.names else ()
+        self.weights = (*self.networks, *given)
+        self.n_opened = self.nx + len(residual_equations(self.plan)) if given else 0
         self.p = np.asarray(system.parameters.values)
         events = self.plan.events
         self.nq = 0 if events is None else len(events.discrete)
         self.ng = 0 if events is None else events.facts.n_guards
         self.nc = 0 if events is None else events.n_clocks
+        self.n_unknowns = self.nx + self.ny + self.ng + self.n_opened
 
     # --- the system at a point --------------------------------------------------------------------------------------
 
     def at(self, p: Array, weights: Sequence[Array]) -> AcausalSystem:
         """The system with these parameters and weights, which are of double precision, whatever the network's are."""
-        own = [w.astype(leaf.value.dtype) for w, leaf in zip(weights, self.weights, strict=True)]
+        own = [w.astype(leaf.value.dtype) for w, leaf in zip(weights, self.networks, strict=False)]
         networks = jax.tree.unflatten(self._tree, own)
         neural = eqx.combine(networks, self.system.neural)
         return eqx.tree_at(lambda s: (s.parameters.values, s.neural), self.system, (p, neural))
@@ -123,9 +130,26 @@ class Programs:
         system = self.at(p, weights).holding(q)
         return system.at(t, self.args(u)).guards(self.whole(system, t, x, z, u))
 
+    def opened(self, t: Array, x: Array, z: Array, q: Array, p: Array, u: Array, *weights: Array) -> Array:
+        """dx/dt, then what equations leave, with given unknowns: shape (n_opened,)."""
+        return opened(self.at(p, weights).holding(q).at(t, self.args(u)), x, weights[-1])
+
     def unknowns(self, *point: Array) -> Array:
-        """The field, the outputs and the guards, shape (nx + ny + ng,)."""
-        return jnp.concatenate([self.field(*point), self.outputs(*point), self.guards(*point)])
+        """The field, the outputs, the guards and what blocks leave, shape (n_unknowns,)."""
+        left = [self.opened(*point)] if self.n_opened else []
+        return jnp.concatenate([self.field(*point), self.outputs(*point), self.guards(*point), *left])
+
+    def unsolved(
+        self, t: Array, x: Array, z: Array, q: Array, p: Array, u: Array, *weights: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """At any z, whether the equations of nonlinear blocks hold or not: (dx/dt, the residuals of these equations,
+        the continuous outputs, the guards)."""
+        here = self.at(p, weights).holding(q).at(t, self.args(u))
+        whole, none = jnp.concatenate([x, z]), jnp.zeros((0,), self.p.dtype)
+        found = here.semi_explicit(whole)
+        outputs = here.quantities(whole, *self._quantity, Refinement.NONE) if self.ny else none
+        guards = here.guards(whole, Refinement.NONE) if self.ng else none
+        return found[: self.nx], found[self.nx :], outputs, guards
 
     def _moving(self, z: Array, q: Array) -> Callable[..., Array]:
         """`unknowns` of what they are differentiated by."""
@@ -266,7 +290,7 @@ class Programs:
         shapes = {
             "t": (), "x": (self.nx,), "z": (self.nz,), "q": (self.nq,), "u": (len(self.plan.inputs.names),),
             "s": (len(self.starts),), "of_guards": (2, self.ng), "of_clocks": (2, self.nc), "of_run": (RUN,),
-            "unknowns": (self.nx + self.ny + self.ng,),
+            "unknowns": (self.n_unknowns,),
         }  # fmt: skip
         return {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()} | {
             "p": jax.ShapeDtypeStruct(self.p.shape, dtype),
@@ -285,6 +309,8 @@ class Programs:
             "field": (self.field, (*point, *weights)),
             "outputs": (self.outputs, (*point, *weights)),
             "guards": (self.guards, (*point, *weights)),
+            "unsolved": (self.unsolved, (*point, *weights)),
+            "opened": (self.opened, (*point, *weights)),
             "forward": (
                 lambda z, q, *both: self.forward(z, q, both[: len(moving)], both[len(moving) :]),
                 (n["z"], n["q"], *moving, *moving),
@@ -299,6 +325,12 @@ class Programs:
             "accept": (self.accept, (*point, *memory, number, *weights)),
         }
         return {name: jax.make_jaxpr(given[name][0])(*given[name][1]) for name in self.names}
+
+
+def _given_at_start(system: AcausalSystem) -> np.ndarray:
+    """The unknowns of blocks at the start."""
+    quantities = given_quantities(system.plan)
+    return np.asarray(system.at(0.0).quantities(system.initialize(), quantities, np.ones(len(quantities))))
 
 
 def _name_of_leaf(path: Sequence[Any]) -> str:

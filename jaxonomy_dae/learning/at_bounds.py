@@ -40,6 +40,8 @@ def at_bounds(rows: Rows, moves: Bool[np.ndarray, " p"], noise: float) -> dict[i
     - `rows`: weighted residuals and Jacobian at the minimum, with those of priors.
     - `noise`: the relative error of the Jacobian.
     """
+    if moves.all():
+        return {}
     factors = Factors.of(rows.residual, rows.jacobian[:, moves], noise)
     along = rows.jacobian[:, moves] @ factors.root(factors.rank(noise))  # columns of length one
     found = {}

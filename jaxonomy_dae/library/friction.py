@@ -57,9 +57,12 @@ def stick_slip(
     still = component.parameter("standstill", STANDSTILL, unit=speed_unit, bounds=POSITIVE)
     per = {"m/s": "1/kg", "rad/s": "rad/(kg*m*m)"}.get(speed_unit, "")  # of other speeds, units are not checked
     compliance = component.parameter("compliance", COMPLIANCE, unit=per, bounds=POSITIVE)
+    # Parts that are always pressed together are held until the initial speed has said which way they slide: without
+    # any friction, nothing would determine what lies between two of them in a row.
     stuck: Boolean = Eq(mode, 0)
+    held = stuck if pressed is not None else Ne(Abs(mode), 1)
     branch = Piecewise((0, Eq(mode, 2)), (mode * sliding, True))
-    component.either(stuck, compliance * friction - der(speed), friction - branch)
+    component.either(held, compliance * friction - der(speed), friction - branch)
     direction = Piecewise((1, speed > still), (-1, speed < -still), (0, True))
     moving = Eq(Abs(mode), 1)
     if pressed is None:

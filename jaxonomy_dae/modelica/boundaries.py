@@ -22,11 +22,36 @@ from .rumoca_expressions import SCALAR, Json
 
 MODEL = "Opened"  # of the text in which a class is opened
 _INSIDE, _RIM = "opened__", "rim__"  # the class, and its boundaries, in that model
-_FRAME = "Modelica.Mechanics.MultiBody.Interfaces.Frame_a"
-_ORIENTATION = ".R"  # ends the name of a record of frames that is overdetermined
-_LACKING = 9
+
+
+class _Kind(NamedTuple):
+    """A kind of overdetermined records, by the end of their names.
+
+    - `connector`: a class of connectors with such a record.
+    - `root`: equations of a boundary `{rim}` that is a root.
+    - `in_place`: those in place of a connection of a record `{of}` to it.
+    - `lacking`: how many these are.
+    """
+
+    ending: str
+    connector: str
+    root: str
+    in_place: str
+    lacking: int
+
+
 # A frame has 12 overdetermined quantities and 3 torques: its boundary lacks 9 equations.
-_IN_PLACE = "{0}.w = {1}.r_0; {0}.T[1, :] = {1}.r_0; {0}.T[2, :] = {1}.r_0;"
+_KINDS = (
+    _Kind(
+        ".R", "Modelica.Mechanics.MultiBody.Interfaces.Frame_a",
+        "{rim}.r_0 = zeros(3); {rim}.R = Modelica.Mechanics.MultiBody.Frames.nullRotation();",
+        "{of}.w = {rim}.r_0; {of}.T[1, :] = {rim}.r_0; {of}.T[2, :] = {rim}.r_0;", 9,
+    ),
+    _Kind(
+        ".reference", "Modelica.Electrical.QuasiStatic.SinglePhase.Interfaces.PositivePin",
+        "{rim}.v.re = 0; {rim}.v.im = 0; {rim}.reference.gamma = 0;", "{of}.gamma = {rim}.reference.gamma;", 1,
+    ),
+)  # fmt: skip
 
 
 class Closed(NamedTuple):
@@ -45,10 +70,10 @@ def flattened(
     name: str,
     changes: str = "",
     source: str | None = None,
-    frames: Callable[[], Sequence[str]] = list,
+    records: Callable[[], Sequence[str]] = list,
 ) -> Closed:
-    """Flattens a class, alone or, if its connectors ask for it, with boundaries. `frames` names its connectors
-    that are frames: nothing else tells of those that no equation turns.
+    """Flattens a class, alone or, if its connectors ask for it, with boundaries. `records` names the overdetermined
+    records of its connectors: nothing else tells of those that no equation relates to others.
 
     **Raises:**
 
@@ -56,7 +81,7 @@ def flattened(
     """
     before = f"{source or ''}\n"
     modified = f"{_INSIDE}({changes})" if changes else _INSIDE
-    alone, trees = _alone(front_end, name, changes, source, frames)
+    alone, trees = _alone(front_end, name, changes, source, records)
     streams = list(_with_streams(alone.flat))
     if not trees and not streams:
         return Closed(alone, graph=_edges(alone.flat), roots=tuple(alone.flat["definite_roots"]))
@@ -80,7 +105,7 @@ def flattened(
 
 
 def _alone(
-    front_end: FrontEnd, name: str, changes: str, source: str | None, frames: Callable[[], Sequence[str]]
+    front_end: FrontEnd, name: str, changes: str, source: str | None, records: Callable[[], Sequence[str]]
 ) -> tuple[Flattened, list[str]]:
     """The class by itself, and the overdetermined records that need a root outside."""
     extended = f"extends {name}({changes});" if changes else f"extends {name};"
@@ -93,17 +118,17 @@ def _alone(
             else:
                 found = front_end.flatten(source, name)
         except Unrooted as error:
-            if not error.record.endswith(_ORIENTATION) or error.record in trees:
+            if _kind_of(error.record) is None or error.record in trees:
                 raise
             trees.append(error.record)
             continue
         except Unbalanced as error:
-            loose = [f"{n}{_ORIENTATION}" for n in frames() if f"{n}{_ORIENTATION}" not in trees]
-            if not loose or error.missing != _LACKING * len(loose):
+            loose = [r for r in records() if r not in trees]
+            if not loose or error.missing != sum(kind.lacking for r in loose if (kind := _kind_of(r))):
                 raise
             trees += loose
             continue
-        wanting = [r for r in _believed(found.flat) if r.endswith(_ORIENTATION) and r not in trees]
+        wanting = [r for r in _believed(found.flat) if _kind_of(r) and r not in trees]
         if not wanting:
             return found, trees
         trees += wanting
@@ -112,6 +137,10 @@ def _alone(
 def _model(declared: Sequence[str], equations: Sequence[str]) -> str:
     body = f" equation {' '.join(equations)}" if equations else ""
     return f"model {MODEL} {' '.join(declared)}{body} end {MODEL};\n"
+
+
+def _kind_of(record: str) -> _Kind | None:
+    return next((kind for kind in _KINDS if record.endswith(kind.ending)), None)
 
 
 def _believed(flat: Json) -> Iterator[str]:
@@ -129,10 +158,12 @@ def _roots(trees: Sequence[str], inside: str) -> tuple[list[str], list[str]]:
     """Boundaries that are roots of trees, and equations that begin with them."""
     declared, equations = [], []
     for k, record in enumerate(trees):
-        rim, of = f"{_RIM}r{k}", f"{inside}{record}"
-        declared.append(f"{_FRAME} {rim};")
-        equations.append(f"Connections.root({rim}.R); Connections.branch({rim}.R, {of}); {rim}.r_0 = zeros(3);")
-        equations.append(f"{rim}.R = Modelica.Mechanics.MultiBody.Frames.nullRotation(); {_IN_PLACE.format(of, rim)}")
+        rim, of, kind = f"{_RIM}r{k}", f"{inside}{record}", _kind_of(record)
+        assert kind is not None
+        declared.append(f"{kind.connector} {rim};")
+        root = f"{rim}{kind.ending}"
+        equations.append(f"Connections.root({root}); Connections.branch({root}, {of});")
+        equations.append(f"{kind.root} {kind.in_place}".format(rim=rim, of=of))
     return declared, equations
 
 

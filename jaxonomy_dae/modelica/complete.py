@@ -12,7 +12,7 @@ from typing import Any
 from .builtin import FUNCTIONS
 from .flat_model import FlatModel
 from .sources import Constant, Found, Member, Sources
-from .tree import Call, Class, Comprehension, Declaration, Effect, Loop, Modifiers, Part, Reference, each_part
+from .tree import Call, Class, Comprehension, Declaration, Effect, Loop, Part, Reference, each_part
 
 _BUILT_IN = ("Real", "Integer", "Boolean", "String")
 _RECORDS = ("record", "class")
@@ -65,7 +65,7 @@ def _is_like(library: Sources, package: Found, c: Class) -> bool:
     found = library.member(package, c.name.rpartition(".")[2])
     if not isinstance(found, Found):
         return False
-    ours = {d.name for d, _ in _Writer(library, {}).declarations(found)}
+    ours = {d.name for d, _ in library.declarations(found)}
     return ours == {d.name for d in c.declarations} and found.source.comment in ("", c.comment)
 
 
@@ -85,47 +85,19 @@ class _Writer:
         self.classes[name] = empty
         if source.literals:
             return name
-        pairs = self.declarations(found)
+        pairs = self.library.declarations(found)
         local = frozenset(d.name for d, _ in pairs)
         declarations = tuple(self._declaration(d, scopes, local) for d, scopes in pairs)
         algorithms = [
             tuple(self._renamed(s, part.inside, local) for s in section)
-            for part in self._lineage(found)
+            for part in self.library.lineage(found)
             for section in part.source.algorithms
         ]
-        external = next((p.source.external for p in self._lineage(found) if p.source.external is not None), None)
+        external = next((p.source.external for p in self.library.lineage(found) if p.source.external is not None), None)
         self.classes[name] = empty._replace(
             declarations=declarations, algorithms=tuple(algorithms), external=external
         )  # fmt: skip
         return name
-
-    def declarations(self, found: Found) -> list[tuple[Declaration, tuple[Found, ...]]]:
-        """The declarations of a class and its bases, as short definitions change them, each with its scopes."""
-        out: dict[str, tuple[Declaration, tuple[Found, ...]]] = {}
-
-        def change(modifiers: Modifiers, scopes: tuple[Found, ...]) -> None:
-            for name, value in modifiers.items():
-                if name in out and value is not None and not isinstance(value, Declaration | dict):
-                    out[name] = out[name][0]._replace(value=value), scopes
-
-        for part in self._lineage(found):
-            out |= {d.name: (d, part.inside) for d in part.source.declarations}
-            for _, modifiers in part.source.bases:  # which are in now
-                change(modifiers, part.inside)
-        for modifiers, scopes in reversed(found.changes):
-            change(modifiers, scopes)
-        return list(out.values())
-
-    def _lineage(self, found: Found) -> list[Found]:
-        """What a class continues or extends, the first base first, and the class itself."""
-        out: list[Found] = []
-        if found.source.continues:
-            inherited = self.library.inherited_class(found)
-            out += self._lineage(inherited) if inherited else []
-        for base, _ in found.source.bases:
-            target = self.library.class_of(base, found.scopes)
-            out += self._lineage(target) if target else []
-        return [*out, found]
 
     def _declaration(self, d: Declaration, scopes: tuple[Found, ...], local: frozenset[str]) -> Declaration:
         kind, more = self._type(d.type, scopes)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ..base.errors import ModelError, nearest
 from ..base.optional import optional_module
-from .readable_sources import with_readable_parameters
+from .readable_sources import with_readable_sources
 from .rumoca_expressions import Json
 
 _PLACE = re.compile(r"× (?P<what>[^\n]*)\s+╭─\[[^\]]*?:(?P<line>\d+):(?P<column>\d+)\]")
@@ -87,7 +87,7 @@ class FrontEnd:
             if any(f.is_dir() for f in folders):
                 copies = Path(tempfile.mkdtemp(prefix="modelica-"))
                 weakref.finalize(self, shutil.rmtree, copies, True)
-                folders = [with_readable_parameters(f, copies) if f.is_dir() else f for f in folders]
+                folders = with_readable_sources(folders, copies)
             self.readable = folders
             self.session = self.rumoca.Session(roots=[str(root) for root in self.readable])
         return self.session

@@ -2,7 +2,7 @@
 
 import functools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,6 @@ from .open_class import OpenClass, opened
 from .open_component import OpenComponent
 from .shelf import Shelf
 from .sources import Found, Sources
-
-_FRAME = re.compile(r"(^|\.)Frame(_[ab])?$")  # types of connectors of three-dimensional bodies
 
 
 class Library:
@@ -88,16 +86,29 @@ class Library:
         if source is None:
             self._check_known(name)
         return opened(
-            name, flattened(self.front_end, name, changes, source, functools.partial(self._frames, name, source))
+            name, flattened(self.front_end, name, changes, source, functools.partial(self._records, name, source))
         )
 
-    def _frames(self, name: str, source: str | None) -> list[str]:
-        """The connectors of a class of the library that are declared as frames."""
-        if source is not None:
+    def _records(self, name: str, source: str | None) -> list[str]:
+        """The overdetermined records of the connectors of a class of the library."""
+        found = self._names.find(name) if source is None else None
+        if not isinstance(found, Found):
             return []
-        found = self._names.find(name)
-        declared = self._names.declared(found) if isinstance(found, Found) else ()
-        return [d.name for d in declared if _FRAME.search(d.type) and not d.dimensions]
+        return [
+            f"{connector.name}.{record}"
+            for connector, scopes in self._names.declarations(found)
+            if not connector.dimensions
+            and (of := self._names.class_of(connector.type, scopes)) is not None
+            and of.source.kind == "connector"
+            for record in self._overdetermined(of)
+        ]
+
+    def _overdetermined(self, connector: Found) -> Iterator[str]:
+        """The records of a connector whose type has a function `equalityConstraint`: they are overdetermined."""
+        for d, scopes in self._names.declarations(connector):
+            of = self._names.class_of(d.type, scopes)
+            if of is not None and isinstance(self._names.member(of, "equalityConstraint"), Found):
+                yield d.name
 
     def _check_known(self, name: str) -> None:
         """Names what is near a class that no root holds, before the front end reads the whole library."""

@@ -20,12 +20,15 @@ AS_TEXT = (
     "a part of a model that has such connectors inside opens as a whole: write it as a Modelica text with plain "
     "connectors outside, component(name, source=text, roots=[…])"
 )
+# Overdetermined quantities: the rotations of frames, and the angles of quasi-static references, which connections of a
+# tree only make equal.
+_KNOWN = re.compile(r"\.R\.[Tw]$|\.reference\.gamma$")
 
 
 @dataclasses.dataclass(frozen=True)
 class OpenPort:
     """A connector: pairs (name, unit) of its potentials, of its flows, which count positive into the class, and of its
-    streams; and the names of those potentials that are the overdetermined record of a frame."""
+    streams; and the names of those potentials that are an overdetermined record."""
 
     name: str
     potentials: tuple[tuple[str, str], ...]
@@ -68,8 +71,8 @@ def opened(name: str, closed: Closed) -> OpenClass:
 
     **Raises:**
 
-    - `ModelError` for connectors of overdetermined graphs other than those of frames, and for those without variables;
-        and for those that have not as many flows as potentials.
+    - `ModelError` for connectors of overdetermined graphs other than those of frames and quasi-static references, for
+        those without variables, and for those that have not as many flows as potentials.
     """
     found = closed.found
     if found.flat.get("is_partial"):
@@ -94,6 +97,8 @@ def opened(name: str, closed: Closed) -> OpenClass:
             (tunable if free else fixed).extend(names)
             required += [n for n in names if free and declared[n].value is None]
         elif "." not in re.sub(r"\[[^]]*\]", "", v["name"]) or v["role"] == "input":
+            if at["causality"] == "input":  # those that the class binds are its own variables
+                names = [n for n in names if v["role"] == "input" and declared[n].value is None]
             roles.get(at["causality"], []).extend(names)
     return OpenClass(
         name, found.flat.get("model_description") or "", flat, ports, tuple(roles["input"]), tuple(roles["output"]),
@@ -128,7 +133,7 @@ def _ports(name: str, top: str, variables: Mapping[str, Json]) -> Iterator[OpenP
     where = f"'{name}': the connector '{top}'"
     if not inside:
         raise ModelError(f"{where} is expandable: {AS_TEXT}")
-    if any(v["is_overconstrained"] and not re.search(r"\.R\.[Tw]$", n) for n, v in inside.items()):
+    if any(v["is_overconstrained"] and not _KNOWN.search(n) for n, v in inside.items()):
         raise ModelError(f"{where} is of an overdetermined graph, whose root its surroundings decide: {AS_TEXT}")
     scalars = {entry: v for n, v in physical.items() for entry in _entries(n, v["dims"])}
     for group in _innermost(top, list(scalars), scalars):
@@ -138,13 +143,18 @@ def _ports(name: str, top: str, variables: Mapping[str, Json]) -> Iterator[OpenP
             kind = next((k for k in ("flow", "stream") if scalars[n][k]), "potential")
             sides[kind].append((n[len(prefix) + 1 :], scalars[n].get("unit") or ""))
         orientation = tuple(n[len(prefix) + 1 :] for n in members if scalars[n]["is_overconstrained"])
-        freedom = len(sides["potential"]) - len(orientation) + (3 if orientation else 0)
+        freedom = len(sides["potential"]) - len(orientation) + (3 if is_frame(orientation) else 0)
         if freedom != len(sides["flow"]):
             counts = f"{len(sides['potential'])} potentials and {len(sides['flow'])} flows"
             raise ModelError(f"'{name}': the connector '{prefix}' has {counts}: {AS_TEXT}")
         if members:
             potentials, flows, streams = map(tuple, sides.values())
             yield OpenPort(prefix, potentials, flows, streams, orientation)
+
+
+def is_frame(orientation: Sequence[str]) -> bool:
+    """True if overdetermined quantities are those of a frame, which turns in three directions."""
+    return any(n.startswith("R.") for n in orientation)
 
 
 def _is_constant(v: Json) -> bool:

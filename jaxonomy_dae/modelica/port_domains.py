@@ -6,7 +6,7 @@ import numpy as np
 import sympy
 
 from ..write.ports import Domain, Electrical, Hydraulic, Overdetermined, Rotational, Thermal, Translational
-from .open_class import OpenPort
+from .open_class import OpenPort, is_frame
 
 
 def domain_of(port: OpenPort) -> Domain:
@@ -31,8 +31,15 @@ def _named(port: OpenPort) -> Domain:
         tuple((name, _unit(unit)) for name, unit in side) for side in (port.potentials, port.flows, port.streams)
     )
     if port.orientation:
-        return Domain("frame", across, through, streams, Overdetermined(port.orientation, _turned))
+        if is_frame(port.orientation):
+            return Domain("frame", across, through, streams, Overdetermined(port.orientation, _turned))
+        return Domain(f"({names})", across, through, streams, Overdetermined(port.orientation, _nothing))
     return Domain(f"({names})", across, through, streams)
+
+
+def _nothing(a: Mapping[str, sympy.Symbol], b: Mapping[str, sympy.Symbol]) -> Sequence[sympy.Expr]:
+    """What a loop demands of quasi-static references: their angles are equal by what turns them."""
+    return []
 
 
 def _turned(a: Mapping[str, sympy.Symbol], b: Mapping[str, sympy.Symbol]) -> Sequence[sympy.Expr]:

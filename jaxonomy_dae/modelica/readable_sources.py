@@ -1,15 +1,28 @@
-"""Copies of libraries in which rumoca reads all parameters.
+"""Copies of libraries in which rumoca reads all parameters and all equations of complex numbers.
 
 rumoca 0.10.2 takes a parameter that is bound to a look-up in a table for an unknown with an equation, so that Clutch,
 Brake and OneWayClutch of the Modelica library have one equation too many. In the copy, an initial equation gives such a
-parameter its value. Folders without one are links to the originals, and no line moves.
+parameter its value. `complex_sources` says what it does not read of complex numbers. Folders without such files are
+links to the originals, and no line moves.
 """
 
+import contextlib
+import gzip
+import hashlib
+import json
 import os
 import re
 import shutil
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from ..host.kept import folder_of
+from .boolean_connections import with_single_connections
+from .complex_sources import with_real_equations
+from .kept_files import contents, write
+from .sources import Sources
+
+_FORMAT = 2  # to be raised with every change of what is changed in sources
 _LOOK_UP = "getTable1DValue"
 # parameter Type name(modifiers) = binding "comment";
 _BOUND = re.compile(
@@ -19,18 +32,43 @@ _BOUND = re.compile(
 _EQUATIONS = re.compile(r"^[ \t]*equation\b", re.M)
 
 
-def with_readable_parameters(root: Path, copies: Path) -> Path:
-    """The folder `root`, or a copy of it below the folder `copies` if a file in it has to be changed."""
-    changed = {}
-    for file in root.rglob("*.mo"):
-        text = file.read_text(encoding="utf-8", errors="replace")
-        if _LOOK_UP in text and (new := _by_initial_equations(text)) != text:
-            changed[file.relative_to(root)] = new
+def with_readable_sources(roots: Sequence[Path], copies: Path) -> list[Path]:
+    """The folders `roots`; in place of one in which a file is changed, a copy of it below the folder `copies`."""
+    sources = Sources(roots)
+    return [_readable(root, copies, sources) if root.is_dir() else root for root in roots]
+
+
+def _readable(root: Path, copies: Path, sources: Sources) -> Path:
+    changed = _kept(root, sources)
     if not changed:
         return root
     copy = copies / str(len(list(copies.iterdir())))
-    _mirror(root, copy, Path(), changed)
+    _mirror(root, copy, Path(), {Path(name): text for name, text in changed.items()})
     return copy
+
+
+def _kept(root: Path, sources: Sources) -> dict[str, str]:
+    """The files that are changed, kept for the next process: to find them takes some 10 s for the Modelica library."""
+    folder = folder_of("modelica")
+    if folder is None:
+        return dict(_changed(root, sources))
+    told = json.dumps([_FORMAT, [contents(r, folder) for r in sources.roots], str(root)])
+    path = folder / "readable" / f"{hashlib.sha256(told.encode()).hexdigest()}.gz"
+    with contextlib.suppress(OSError, EOFError, ValueError):
+        return json.loads(gzip.decompress(path.read_bytes()))
+    changed = dict(_changed(root, sources))
+    write(path, gzip.compress(json.dumps(changed).encode(), 6))
+    return changed
+
+
+def _changed(root: Path, sources: Sources) -> Iterator[tuple[str, str]]:
+    for file in sorted(root.rglob("*.mo")):
+        text = file.read_text(encoding="utf-8-sig", errors="replace")
+        new = _by_initial_equations(text) if _LOOK_UP in text else text
+        new = with_real_equations(sources, new)
+        new = with_single_connections(sources, new)
+        if new != text:
+            yield str(file.relative_to(root)), new
 
 
 def _by_initial_equations(text: str) -> str:

@@ -5,7 +5,6 @@ import gzip
 import hashlib
 import json
 import os
-import tempfile
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 from ..base.errors import ModelError
 from ..host.kept import folder_of
+from .kept_files import contents, write
 from .open_class import OpenClass
 from .read_rumoca import VERSION
 from .stored import FORMAT, read, written
@@ -58,13 +58,13 @@ class Shelf:
         """Keeps a class for the next process, if there is a folder for it."""
         path = self._path(name, changes, source)
         if path is not None:
-            _write(path, gzip.compress(json.dumps(written(found)).encode(), 6))
+            write(path, gzip.compress(json.dumps(written(found)).encode(), 6))
 
     def _path(self, name: str, changes: str, source: str) -> Path | None:
         folder = folder_of("modelica")
         if folder is None:
             return None
-        told = [FORMAT, VERSION, name, changes, source, *(_contents(root, folder) for root in self.sources)]
+        told = [FORMAT, VERSION, name, changes, source, *(contents(root, folder) for root in self.sources)]
         return folder / f"{hashlib.sha256(json.dumps(told).encode()).hexdigest()}.gz"
 
 
@@ -83,25 +83,3 @@ def _archive(file: Path) -> zipfile.ZipFile:
         return zipfile.ZipFile(file)
     except (OSError, zipfile.BadZipFile) as error:
         raise ModelError(f"'{file}' is not a file of packed classes: {error}") from None
-
-
-def _contents(root: Path, folder: Path) -> str:
-    """A digest of the sources in a root. Times and sizes of the files tell whether it is known already."""
-    files = sorted(root.rglob("*.mo")) if root.is_dir() else [root]
-    status = [(str(f), s.st_size, s.st_mtime_ns) for f in files for s in [f.stat()]]
-    known = folder / "contents" / hashlib.sha256(json.dumps(status).encode()).hexdigest()
-    with contextlib.suppress(OSError):
-        return known.read_text()
-    digest = hashlib.sha256()
-    for f in files:
-        digest.update(f"{f.relative_to(root.parent)} {f.stat().st_size}\n".encode() + f.read_bytes())
-    _write(known, digest.hexdigest().encode())
-    return digest.hexdigest()
-
-
-def _write(path: Path, content: bytes) -> None:
-    with contextlib.suppress(OSError):  # a full disk, no permission
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix="new-", delete=False) as new:
-            new.write(content)
-        os.replace(new.name, path)

@@ -31,6 +31,11 @@ class Found:
         """Where names that stand in it are looked up."""
         return (self, *self.scopes)
 
+    @functools.cached_property
+    def key(self) -> tuple:
+        """Equal for classes that were reached alike."""
+        return id(self.source), self.path, tuple(id(modifiers) for modifiers, _ in self.changes)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Constant:
@@ -66,6 +71,9 @@ class Sources:
         self.outermost: dict[str, Found | None] = {}
         self.busy: set[tuple[int, str]] = set()
         self.holders: dict[str, list[Found]] = {}
+        self.looked_up: dict[tuple, tuple[Member, list[str]] | None] = {}
+        self.declared: dict[tuple, list[tuple[Declaration, tuple[Found, ...]]]] = {}
+        self.absent: set[tuple[int, str]] = set()
 
     def find(self, name: str) -> Member | None:
         """What a full name stands for; None if no root holds it."""
@@ -83,6 +91,16 @@ class Sources:
 
     def lookup(self, name: str, scopes: Sequence[Found]) -> tuple[Member, list[str]] | None:
         """(What the longest beginning of a name that is a class or constant stands for, the parts behind it)."""
+        key = name, *(s.key for s in scopes)
+        if key in self.looked_up:
+            return self.looked_up[key]
+        complete = not self.busy
+        found = self._lookup(name, scopes)
+        if complete:
+            self.looked_up[key] = found
+        return found
+
+    def _lookup(self, name: str, scopes: Sequence[Found]) -> tuple[Member, list[str]] | None:
         first, *rest = name.split(".")
         for scope in scopes:
             found = self.member(scope, first) or self._imported(scope, first)
@@ -116,10 +134,12 @@ class Sources:
 
     def _own(self, of: Found, name: str) -> Member | None:
         source = of.source
-        if name not in source.classes and source.folder is not None:
+        if name not in source.classes and source.folder is not None and (id(source), name) not in self.absent:
             for file in (source.folder / f"{name}.mo", source.folder / name / "package.mo"):
                 if file.exists():
                     source.classes[name] = read_source(file)
+            if name not in source.classes:
+                self.absent.add((id(source), name))
         if name in source.classes:
             return self._followed(Found(source.classes[name], f"{of.path}.{name}", of.inside))
         for d in source.declarations:
@@ -168,13 +188,39 @@ class Sources:
             return found
         return Found(found.source, f"{of.path}.{name}", (of, *found.scopes, *of.scopes), found.changes)
 
-    def declared(self, of: Found) -> Iterator[Declaration]:
-        """The declarations of a class, inherited ones among them."""
-        yield from of.source.declarations
-        for base, _ in of.source.bases:
-            target = self.class_of(base, of.scopes)
-            if target is not None:
-                yield from self.declared(target)
+    def declarations(self, found: Found) -> list[tuple[Declaration, tuple[Found, ...]]]:
+        """The declarations of a class and its bases, as short definitions change them, each with its scopes."""
+        key = found.key, *(s.key for s in found.scopes)
+        if key not in self.declared:
+            self.declared[key] = self._declarations(found)
+        return self.declared[key]
+
+    def _declarations(self, found: Found) -> list[tuple[Declaration, tuple[Found, ...]]]:
+        out: dict[str, tuple[Declaration, tuple[Found, ...]]] = {}
+
+        def change(modifiers: Modifiers, scopes: tuple[Found, ...]) -> None:
+            for name, value in modifiers.items():
+                if name in out and value is not None and not isinstance(value, Declaration | dict):
+                    out[name] = out[name][0]._replace(value=value), scopes
+
+        for part in self.lineage(found):
+            out |= {d.name: (d, part.inside) for d in part.source.declarations}
+            for _, modifiers in part.source.bases:  # which are in now
+                change(modifiers, part.inside)
+        for modifiers, scopes in reversed(found.changes):
+            change(modifiers, scopes)
+        return list(out.values())
+
+    def lineage(self, found: Found) -> list[Found]:
+        """What a class continues or extends, the first base first, and the class itself."""
+        out: list[Found] = []
+        if found.source.continues:
+            inherited = self.inherited_class(found)
+            out += self.lineage(inherited) if inherited else []
+        for base, _ in found.source.bases:
+            target = self.class_of(base, found.scopes)
+            out += self.lineage(target) if target else []
+        return [*out, found]
 
     def inherited_class(self, found: Found) -> Found | None:
         """What `redeclare function extends f` continues: f as the bases of its package have it."""

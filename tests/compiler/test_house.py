@@ -31,6 +31,7 @@ DEFERRED = {
 CLOSING = {
     ("run/system/system", "fmi/export"): "a method of a system writes it as an FMU",
     ("run/system/system", "fmi/plain_c"): "a method of a system writes it as C code",
+    ("run/system/system", "fmi/to_casadi"): "a method of a system makes a function of CasADi",
     ("run/simulation/solution", "run/simulation/energy_balance"): "the balance of a solution is that of a second run",
     ("learning/*", "learning/estimate"): "an estimate's methods call the modules that read it",
     ("learning/estimate", "learning/problem"): "a problem makes the estimates that know it",

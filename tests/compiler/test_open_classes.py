@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import zipfile
 
 import numpy as np
@@ -16,10 +17,13 @@ from jaxonomy_dae.host import kept
 from jaxonomy_dae.library import electrical, thermal
 from jaxonomy_dae.modelica import Library, component
 from jaxonomy_dae.modelica.__main__ import main
+from jaxonomy_dae.modelica.boolean_connections import with_single_connections
+from jaxonomy_dae.modelica.complex_sources import with_real_equations
 from jaxonomy_dae.modelica.front_end import FrontEnd
 from jaxonomy_dae.modelica.left_out import LEFT_OUT
-from jaxonomy_dae.modelica.readable_sources import with_readable_parameters
+from jaxonomy_dae.modelica.readable_sources import with_readable_sources
 from jaxonomy_dae.modelica.shelf import pack
+from jaxonomy_dae.modelica.sources import Sources
 from jaxonomy_dae.modelica.stored import read, written
 from jaxonomy_dae.write import Electrical, Rotational, Thermal
 from jaxonomy_dae.write.ports import Port
@@ -240,7 +244,7 @@ def test_classes_are_data(library, tmp_path):
         packed.component("Devices.Load", m=2)
     with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
         archive.writestr("A.json", json.dumps({"format": 0}))
-    with pytest.raises(ModelError, match=r"this is no class of format 2: it has format 0"):
+    with pytest.raises(ModelError, match=r"this is no class of format 3: it has format 0"):
         Library(tmp_path / "c.zip")["A"]
     (tmp_path / "d.zip").write_bytes(b"none")
     with pytest.raises(ModelError, match=r"'.*d.zip' is not a file of packed classes"):
@@ -269,7 +273,7 @@ end Clutch;
     (root / "Parts" / "Clutch.mo").write_text(clutch)
     copies = tmp_path / "copies"
     copies.mkdir()
-    copy = with_readable_parameters(root, copies)
+    [copy] = with_readable_sources([root], copies)
     lines = (copy / "Parts" / "Clutch.mo").read_text().splitlines()
     assert len(lines) == len(clutch.splitlines())
     assert lines[3].strip() == 'final parameter Real mu0(unit = "1", fixed = false)'
@@ -279,7 +283,7 @@ end Clutch;
     )
     assert (copy / "Parts" / "Other" / "package.mo").read_text().startswith("within Parts;")
     (root / "Parts" / "Clutch.mo").write_text(clutch.replace("getTable1D", "getTable2D"))
-    assert with_readable_parameters(root, copies) == root
+    assert with_readable_sources([root], copies) == [root]
 
 
 def test_a_library_is_packed_from_the_command_line(tmp_path, library, capsys):
@@ -304,3 +308,89 @@ def test_a_part_of_a_text_is_counted_from_one():
     """Transformers of the library find their windings in texts such as "Dy05"."""
     substring = LEFT_OUT["Modelica.Utilities.Strings.substring"]
     assert [substring("Dy05", 1, 1), substring("Dy05", 2, 2), substring("Dy05", 3, 4)] == ["D", "y", "05"]
+
+
+COMPLEX = """
+operator record Complex "a complex number"
+  Real re;
+  Real im;
+  encapsulated operator '*'
+    function multiply
+      import Complex;
+      input Complex a;
+      input Complex b;
+      output Complex c;
+    algorithm
+      c := Complex(a.re*b.re - a.im*b.im, a.re*b.im + a.im*b.re);
+    end multiply;
+  end '*';
+end Complex;
+"""
+PHASORS = """
+package Phasors
+  constant Complex j = Complex(0, 1);
+  function conj input Complex c; output Complex d; algorithm d := Complex(c.re, -c.im); end conj;
+  function exp input Complex c; output Complex d;
+  algorithm d := Complex(Modelica.Math.exp(c.re)*cos(c.im), Modelica.Math.exp(c.re)*sin(c.im)); end exp;
+  function real input Complex c; output Real r; algorithm r := c.re; end real;
+  partial model Base
+    Complex a; Complex b; Complex y; Real w; Real p;
+  end Base;
+  model Split "its equations, to be filled in"
+    extends Base;
+  equation
+    y = {};
+    p = {};
+  end Split;
+end Phasors;
+"""
+SPLIT = {
+    "a*b": lambda a, b, w: a * b,
+    "a/b - w": lambda a, b, w: a / b - w,
+    "w - j*w*a": lambda a, b, w: w - 1j * w * a,
+    "w/(a + b)": lambda a, b, w: w / (a + b),
+    "-conj(a)*b*w": lambda a, b, w: -np.conj(a) * b * w,
+    "if w > 0 then Complex(w)*a else b": lambda a, b, w: w * a,
+    "exp(a*j)": lambda a, b, w: np.exp(1j * a),
+}
+
+
+@pytest.mark.parametrize("text", SPLIT)
+def test_equations_of_complex_numbers_are_two_of_real_ones(text, tmp_path):
+    """Beside Python's complex numbers. No line moves."""
+    (tmp_path / "Complex.mo").write_text(COMPLEX)
+    source = PHASORS.replace("{}", text, 1).replace("{}", f"real({text})")
+    (tmp_path / "Phasors.mo").write_text(source)
+    new = with_real_equations(Sources([tmp_path]), source)
+    assert new.count("\n") == source.count("\n") and text not in new
+    a, b, w = 0.3 - 0.7j, 1.1 + 0.4j, 2.0
+    found = dict(re.findall(r"(y\.re|y\.im|\bp) = ([^;]*);", new))
+    names = {f"{n}_{k}": getattr(x, k2) for n, x in (("a", a), ("b", b)) for k, k2 in (("re", "real"), ("im", "imag"))}
+    names |= {"w": w, "exp": np.exp, "sin": np.sin, "cos": np.cos}
+    expected = complex(SPLIT[text](a, b, w))
+    for name, value in (("y.re", expected.real), ("y.im", expected.imag), ("p", expected.real)):
+        python = re.sub(r"\b([ab])\.(re|im)", r"\1_\2", found[name]).replace("Modelica.Math.", "")
+        python = re.sub(r"\(if (.*?) then (.*?) else (.*)\)", r"((\2) if \1 else (\3))", python)
+        assert eval(python, names) == pytest.approx(value, rel=1e-13), name
+
+
+def test_connections_of_arrays_of_boolean_connectors_are_loops(tmp_path):
+    source = """package Bank
+  connector Signal = input Boolean;
+  model Switch
+    Signal on;
+  end Switch;
+  model Switches
+    parameter Integer m = 3;
+    Signal on[m];
+    Switch switch[m];
+  equation
+    connect(on, switch.on);
+    connect(on[1], switch[1].on);
+  end Switches;
+end Bank;
+"""
+    (tmp_path / "Bank.mo").write_text(source)
+    new = with_single_connections(Sources([tmp_path]), source)
+    loop = "for k__ in 1:size(on, 1) loop connect(on[k__], switch[k__].on); end for;"
+    assert new == source.replace("connect(on, switch.on);", loop)

@@ -165,3 +165,19 @@ def test_noise_of_first_order():
     assert fit.rms["experiment 0"]["c.x"] == pytest.approx(np.std(data.data["c.x"] - there), rel=0.05)
     with pytest.raises(ModelError, match="is correlated, rho, which method=Shooting does not take"):
         fitted(data, method=learning.Shooting(3))
+
+
+@pytest.mark.slow
+def test_samples_that_are_too_few_to_tell_their_noise_are_named():
+    """One sample was `ok` with a noise level of rounding, or 1e12 times too small."""
+    y = swing() + NOISE * noise(0)
+    problem = learning.Problem(oscillator(), record(y), train=["c.k"])
+
+    def of(count, sigma: Any = NOISE):
+        return problem.fit(record(np.where(np.arange(len(TS)) < count, y, np.nan), sigma=sigma), warn=False)
+
+    few = "of 'c.x' there are too few samples ({}) to tell, beside the model's numbers, how large{} the noise is"
+    one, two = of(1, "estimate"), of(2, {"c.x": learning.Noise(rho="estimate")})
+    assert one.reasons[0].startswith(few.format(1, ""))
+    assert two.reasons[0].startswith(few.format(2, " and how correlated"))
+    assert not any("χ²" in reason for reason in of(1).reasons)

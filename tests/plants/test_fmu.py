@@ -16,7 +16,7 @@ from hybrid_models import Ball, Bob, Doubling, SampledPI, Stick, Thermostat
 from hybrid_models import compiled as hybrid
 from problems import compiled, drag_on, mlp, pendulum
 
-from jaxonomy_dae import Component, EqnEnv, der
+from jaxonomy_dae import Component, EqnEnv, der, terminate
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.fmi import export_fmu
 from jaxonomy_dae.fmi.compilers import FLAGS, compiler_for, this_platform
@@ -192,6 +192,10 @@ def test_what_cannot_be_exported_is_refused_by_name(tmp_path, ball):
         export_fmu(system, tmp_path / "x.fmu", parameters=["b.n"])
     with pytest.raises(ModelError, match="platforms: 'amiga' is not known"):
         export_fmu(system, tmp_path / "x.fmu", platforms="amiga")
+    with pytest.raises(ModelError, match="fmi is the version of FMI, 3 or 2; got 1"):
+        export_fmu(system, tmp_path / "x.fmu", fmi=1)
+    with pytest.raises(ModelError, match="arrays: FMI 2 has none"):
+        export_fmu(system, tmp_path / "x.fmu", fmi=2, arrays=True)
     with pytest.raises(ModelError, match="kinds: 'simulink' is not known"):
         export_fmu(system, tmp_path / "x.fmu", kinds=["simulink"])
 
@@ -280,12 +284,72 @@ def test_runs_are_those_of_simulate(tmp_path, kind, names, t1):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "make, names, t1",
+    [
+        (swing, ["pend.x", "pend.vy", "pend.lam"], 2.0), (lambda: hybrid(Ball, "c"), ["c.h", "c.n"], 3.0),
+        (lambda: hybrid(SampledPI, "c"), ["c.x"], 2.05), (lambda: hybrid(House, "c"), ["c.air", "c.q"], 30.0),
+    ],
+    ids=["pendulum", "ball", "loop", "house"],
+)  # fmt: skip
+def test_runs_in_version_2(tmp_path, make, names, t1):
+    """Constraints and a network's weights, events, a clock as time events, an implicit equation with inputs."""
+    system = make()
+    path = exported(system, tmp_path, fmi=2)
+    compare(system, path, t1, names, 1e-6)
+    compare(system, path, t1, names, 1e-6, fmi_type="CoSimulation")
+    check_derivatives(system, path, [n for n in names if n not in system.discretes and n not in system.states])
+    with zipfile.ZipFile(path) as file:
+        file.extractall(tmp_path / "fmu")
+    command = [*(compiler_for(this_platform()) or ()), *FLAGS, "-Wall", "-Wextra", "-Werror", "-O0"]
+    done = subprocess.run(
+        [*command, "fmi2.c", "-o", "x.so", "-lm"], cwd=tmp_path / "fmu/sources", capture_output=True, text=True
+    )
+    assert not done.returncode, done.stderr
+
+
+@pytest.mark.slow
+def test_what_version_2_does_with_states_and_the_end_of_a_run(tmp_path):
+    """A state of the FMU is taken up bit for bit; an event that ends the run ends it for Co-Simulation, too."""
+    with opened(exported(hybrid(Ball, "b"), tmp_path, fmi=2)) as fmu:
+        state = fmu.model.getFMUstate()
+        saved = fmu.model.serializeFMUstate(state)
+
+        def on():
+            fmu.model.enterContinuousTimeMode()
+            fmu.model.setTime(0.5)
+            fmu.model.setContinuousStates(np.array([-1e-9, -4.4]).ctypes.data_as(model_pointer()), 2)
+            assert fmu.model.completedIntegratorStep()[0]
+            fmu.model.enterEventMode()
+            fmu.update()
+            return fmu.get("b.h", "b.v", "b.n", "events.guard[1]")
+
+        first = on()
+        assert first[2] == 1.0
+        fmu.model.setFMUstate(fmu.model.deSerializeFMUstate(saved))
+        assert fmu.get("b.n")[0] == 0.0
+        np.testing.assert_array_equal(on(), first)
+
+    class Ending(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x = self.variable("x", start=0.0, fixed=True)
+            self.add_equations(Eq(der(x), 1.0))
+            self.when(x >= 0.7, terminate("x is large"))
+
+    path = exported(compiled(Ending(EqnEnv(), "c")), tmp_path, "ending", fmi=2)
+    for kind in "ModelExchange", "CoSimulation":
+        found = run(path, 2.0, ["c.x"], fmi_type=kind)
+        assert found["c.x"][-1] == pytest.approx(0.7, abs=1e-6)
+
+
+@pytest.mark.slow
 def test_instances_in_threads_do_not_see_each_other(ball):
-    """Each of 40 balls is dropped from a height of its own, and bounces 250 times at one place."""
+    """Each of 100 balls is dropped from a height of its own, and bounces 100 times at one place."""
 
     def bounced(fmu, k):
         speeds = []
-        for j in range(250):
+        for j in range(100):
             fmu.model.enterContinuousTimeMode()
             fmu.model.setTime(0.01 * (j + 1))
             fmu.model.setContinuousStates(np.array([-1e-12, -1.0 - k]).ctypes.data_as(model_pointer()), 2)
@@ -297,14 +361,14 @@ def test_instances_in_threads_do_not_see_each_other(ball):
 
     found: dict[int, np.ndarray] = {}
     with contextlib.ExitStack() as stack:
-        instances = [stack.enter_context(opened(ball, {"b.h0": 1.0 + k / 100, "b.e": 0.5})) for k in range(40)]
-        threads = [threading.Thread(target=lambda k=k: found.update({k: bounced(instances[k], k)})) for k in range(40)]
+        instances = [stack.enter_context(opened(ball, {"b.h0": 1.0 + k / 100, "b.e": 0.5})) for k in range(100)]
+        threads = [threading.Thread(target=lambda k=k: found.update({k: bounced(instances[k], k)})) for k in range(100)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-        assert [fmu.get("b.n")[0] for fmu in instances] == [250.0] * 40
-    for k in range(40):
+        assert [fmu.get("b.n")[0] for fmu in instances] == [100.0] * 100
+    for k in range(100):
         np.testing.assert_allclose(found[k], 0.5 * (1.0 + k), rtol=1e-9)
 
 
@@ -327,6 +391,31 @@ def test_sanitizers_find_nothing(tmp_path, kind, least):
     done = subprocess.run(["./drive", "20000", "1e-3"], cwd=tmp_path, capture_output=True, text=True)
     assert not done.returncode, done.stdout + done.stderr
     assert int(done.stdout.split()[-1]) >= least
+
+
+@pytest.mark.slow
+def test_arrays_of_components_are_arrays(tmp_path):
+    """Runs and derivatives are those of scalars; what an entry depends on, the array does."""
+    system = ladder(4, in_array=True)
+    scalars, path = exported(system, tmp_path, "scalars"), exported(system, tmp_path, "arrays", arrays=True)
+    names = [f"cell[{k}].c.v" for k in range(4)]
+    for kind in "ModelExchange", "CoSimulation":
+        expected, found = run(scalars, 1.0, names, fmi_type=kind), run(path, 1.0, ["cell.c.v"], fmi_type=kind)
+        assert found["cell.c.v"].shape[1:] == (4,)
+        for k, name in enumerate(names):
+            np.testing.assert_allclose(found["cell.c.v"][:, k], expected[name], rtol=1e-12, atol=1e-12)
+    rng = np.random.default_rng(0)
+    with opened(scalars) as one, opened(path) as other:
+        slopes, along = [f"der({name})" for name in names], rng.normal(size=8)
+        knowns = [*names, *(f"cell[{k}].c.C" for k in range(4))]
+        forward = other.model.getDirectionalDerivative(
+            other.references(["der(cell.c.v)"]), other.references(["cell.c.v", "cell.c.C"]), list(along), 4
+        )
+        np.testing.assert_allclose(forward, one.forward(slopes, knowns, along), rtol=1e-12, atol=1e-12)
+        reverse = other.reverse(["der(cell.c.v)"], ["cell.c.v", "cell.c.C"], along[:4], 8)
+        np.testing.assert_allclose(reverse, one.reverse(slopes, knowns, along[:4], 8), rtol=1e-12, atol=1e-12)
+        derivatives = {u.variable.name: {v.name for v in u.dependencies} for u in other.description.derivatives}
+        assert {"cell.c.v", "cell.r.R", "cell.c.C"} <= derivatives["der(cell.c.v)"]
 
 
 @pytest.mark.slow

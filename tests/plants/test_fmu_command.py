@@ -10,7 +10,7 @@ from hybrid_models import compiled
 from jaxonomy_dae import Component, der
 from jaxonomy_dae.fmi import export_fmu
 from jaxonomy_dae.fmi.__main__ import main
-from jaxonomy_dae.fmi.compilers import TARGETS, compiler_for, this_platform
+from jaxonomy_dae.fmi.compilers import FOLDERS_OF_FMI_2, TARGETS, compiler_for, this_platform
 from jaxonomy_dae.write import Eq
 
 pytest.importorskip("fmpy", reason="FMPy is not installed (extra fmi)")
@@ -24,15 +24,17 @@ class Decay(Component):
         self.add_equations(Eq(der(x), -x))
 
 
-def test_sources_become_a_binary_that_runs(tmp_path, capsys):
+@pytest.mark.parametrize("version", [3, pytest.param(2, marks=pytest.mark.slow)])
+def test_sources_become_a_binary_that_runs(tmp_path, capsys, version):
     system = compiled(Decay, "decay")
-    path = export_fmu(system, tmp_path / "plant.fmu", outputs=["decay.x"], platforms=())
+    path = export_fmu(system, tmp_path / "plant.fmu", outputs=["decay.x"], platforms=(), fmi=version)
     assert main(["validate", str(path)]) == 0
     assert main(["run", str(path)]) == 1
     assert f"{path}: FMPy could not run it" in capsys.readouterr().err
 
+    folder = this_platform() if version == 3 else FOLDERS_OF_FMI_2.get(this_platform(), this_platform())
     assert main(["compile", str(path)]) == 0
-    assert capsys.readouterr().out == f"binaries/{this_platform()}/plant{TARGETS[this_platform()][1]}\n"
+    assert capsys.readouterr().out == f"binaries/{folder}/plant{TARGETS[this_platform()][1]}\n"
     table = tmp_path / "values.csv"
     options = ["--stop-time", "1", "--tolerance", "1e-9", "--kind", "ModelExchange", "--csv", str(table)]
     assert main(["run", str(path), *options]) == 0

@@ -679,3 +679,18 @@ def test_modelica():
         heat, slip = closed(float(names["coefficients"][k]))
         np.testing.assert_allclose(names["heat"][k], heat, rtol=1e-4)
         np.testing.assert_allclose(names["slip"][k], slip, rtol=1e-4, atol=1e-6)
+
+
+def test_out_and_back():
+    pytest.importorskip("fmpy", reason="FMPy is not installed (extra fmi)")
+    names = names_after("out_and_back")
+    assert names["difference"] < 1e-6 and names["of_cvode"] < 1e-6
+    # A gradient is that of differences; their error is that of rounding over the step, beside a sum of thousands.
+    assert names["misfit_along"] == pytest.approx(names["along"], rel=1e-6)
+    # What is left of the residuals is the noise of two components, whose variance is known to 1/sqrt(300).
+    assert names["tuned"].fun == pytest.approx(2 * 0.02**2, rel=0.3)
+    fast = names["speeds"] > 0.5
+    found = np.array(names["strength"](names["law_of"](names["tuned"].x)))
+    np.testing.assert_allclose(found[fast], 1.2 * names["speeds"][fast] ** 2, rtol=0.03, atol=0.02)
+    np.testing.assert_allclose(*names["values"], rtol=1e-7)
+    np.testing.assert_allclose(*names["gradients"], rtol=1e-6)

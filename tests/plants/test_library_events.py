@@ -724,3 +724,19 @@ def test_a_relief_valve_may_begin_open():
     system = compiled(high, low, valve, connect=[(high.fluid, valve.port_a), (valve.port_b, low.fluid)])
     flow = simulate(system, 1.0, ts=jnp.array([0.0, 1.0]))["valve.m_flow"]
     np.testing.assert_allclose(flow, 1e-4 * 0.6 * np.sqrt(2 * hyd.DENSITY * 5.9e6), rtol=1e-9)  # (dp_small/dp)²/4
+
+
+@pytest.mark.slow
+def test_dry_frictions_in_a_row_of_which_the_weaker_slides():
+    """Nothing has mass between them; the model was said to be singular. 2 m/s under 1 N end after 2 s and 2 m."""
+    ev = EqnEnv()
+    mass, wall = line.Mass(ev, "m", initial_position=0.0, initial_velocity=2.0), line.FixedPosition(ev, "wall")
+    weak, strong = StickingFriction(ev, "weak", 1.0), StickingFriction(ev, "strong", 2.0)
+    ends = (wall.flange, strong.flange_a), (strong.flange_b, weak.flange_a), (weak.flange_b, mass.flange)
+    system = compiled(mass, wall, weak, strong, connect=ends)
+
+    def rests(sliding):
+        given = system.with_parameters({"weak.sliding": sliding})
+        return simulate(given, 3.0, initial={"strong.v_rel": 0.0})["m.s"][-1]
+
+    np.testing.assert_allclose(jax.value_and_grad(rests)(1.0), [2.0, -2.0], rtol=1e-7)

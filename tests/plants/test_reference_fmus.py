@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.optimize
 from fmus import fmpy
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning, simulate
 from jaxonomy_dae.fmi import FmuComponent
-from jaxonomy_dae.fmi.compilers import FLAGS, compiler_for, this_platform
-from jaxonomy_dae.fmi.described import FOLDERS_OF_FMI_2
+from jaxonomy_dae.fmi.compilers import FLAGS, FOLDERS_OF_FMI_2, compiler_for, this_platform
+from jaxonomy_dae.library import thermal
 
 SOURCES = os.environ.get("REFERENCE_FMUS", "")
 pytestmark = [
@@ -111,3 +112,66 @@ def test_decay_by_its_rate(tmp_path, version):
     k = jnp.array([0.5, 1.0, 2.0])
     np.testing.assert_allclose(jax.vmap(last)(k), np.exp(-2 * k), atol=1e-8)
     assert jax.grad(last)(0.5) == pytest.approx(-2 * np.exp(-1.0), rel=1e-6)
+
+
+def test_van_der_pol_by_its_parameter(tmp_path):
+    """The gradient by mu beside the variational equation, by SciPy."""
+    _, system = imported(built("VanDerPol", 3, tmp_path))
+
+    def slopes(t, y, mu=1.0):
+        (x, v), (a, b) = y[:2], y[2:]
+        return [v, mu * (1 - x**2) * v - x, b, (1 - x**2) * v + (-2 * mu * x * v - 1) * a + mu * (1 - x**2) * b]
+
+    expected = scipy.integrate.solve_ivp(slopes, (0, 3), [2, 0, 0, 0], "DOP853", rtol=1e-12, atol=1e-12).y[2, -1]
+
+    def last(mu):
+        own = system.with_parameters({"f.mu": mu})
+        return simulate(own, 3.0, rtol=1e-10, atol=1e-12, ts=jnp.array([3.0]))["f.x0"][0]
+
+    assert jax.grad(last)(1.0) == pytest.approx(expected, rel=1e-6)
+
+
+def test_robertsons_reactions(tmp_path):
+    """A stiff model, whose third species is an output: its two indicators pass zero at events that change nothing."""
+    _, system = imported(built("Roberts", 3, tmp_path))
+    ts = np.array([0.4, 4.0, 40.0])
+    run = simulate(system, 40.0, rtol=1e-9, atol=1e-13, ts=jnp.asarray(ts))
+
+    def slopes(t, y):
+        a, b = y
+        flow = 0.04 * a - 1e4 * b * (1 - a - b)
+        return [-flow, flow - 3e7 * b**2]
+
+    expected = scipy.integrate.solve_ivp(slopes, (0, 40), [1, 0], "Radau", ts, rtol=1e-12, atol=1e-15).y
+    np.testing.assert_allclose(run["f.y1"], expected[0], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(run["f.y2"], expected[1], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(run["f.y3"], 1 - expected.sum(axis=0), rtol=0, atol=1e-7)
+
+
+def test_a_fit_around_an_fmu_of_others(tmp_path):
+    """A body that a foreign FMU heats, through a conductor: with w = exp(−k·t) and a = G/C, its temperature is
+    a·(exp(−k·t) − exp(−a·t))/(a − k). The fit finds k inside the FMU and G outside of it."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    fmu = FmuComponent(ev, "f", built("Dahlquist", 3, tmp_path))
+    source, wall = thermal.TemperatureSource(ev, "source"), thermal.ThermalConductor(ev, "wall", G=1.0)
+    body = thermal.HeatCapacitor(ev, "body", 2.0, initial_temperature=0.0)
+    diagram.add(fmu, source, wall, body)
+    diagram.connect(fmu, "x", source, "T")
+    diagram.connect(source.heat, wall.port_a)
+    diagram.connect(wall.port_b, body.heat)
+    system = AcausalCompiler(ev, diagram)()
+
+    k, a, ts = 0.4, 0.75, np.linspace(0.25, 5.0, 20)
+    values = a * (np.exp(-k * ts) - np.exp(-a * ts)) / (a - k)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(len(ts))
+    record = learning.Experiment(jnp.asarray(ts), {"body.T": values + noise}, sigma=1e-3)
+    fit = learning.Problem(system, record, train=["f.k", "wall.G"]).fit()
+
+    # Least squares of the closed form, by SciPy.
+    expected = scipy.optimize.least_squares(
+        lambda p: p[1] * (np.exp(-p[0] * ts) - np.exp(-p[1] * ts)) / (p[1] - p[0]) - values - noise, [0.5, 1.0],
+        xtol=1e-12,
+    )  # fmt: skip
+    found = [fit.system.parameters.table.names.index(name) for name in ("f.k", "wall.G")]
+    k_found, G_found = np.asarray(fit.system.parameters.values)[found]
+    np.testing.assert_allclose([k_found, G_found / 2.0], expected.x, rtol=1e-4)

@@ -8,7 +8,6 @@
 #include "model.h"
 
 #define ROOM(n) ((n) > 0 ? (n) : 1)
-#define N_UNKNOWNS (NX + NY + NG)
 
 typedef struct {
   double d[ND];

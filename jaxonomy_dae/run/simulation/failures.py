@@ -11,7 +11,7 @@ from ...base.aliases import Inputs, Result, State, Time
 from ...base.errors import SimulationError
 from ...base.tolerances import CONSISTENT
 from ...compile.diagnosis.lost_cancellation import lost_cancellation
-from ...compile.diagnosis.wording import listed, quoted
+from ...compile.diagnosis.wording import listed, quoted, some
 from ...compile.lowering.plan import SystemPlan
 from ...compile.model.events import Event
 from ...host.members import is_batched
@@ -31,6 +31,7 @@ from .failed_blocks import failed_block, singular_mode
 from .hybrid_problem import RESTART, resolution
 from .lost_constraints import lost_constraint
 from .preparation import term_of
+from .repeated_events import turning_in_turn, writes_what_holds
 from .solution import Solution
 
 # A run that failed for another reason (steps too short, too many) is explained by a singular choice of states if a
@@ -116,6 +117,9 @@ def explain(solution: Solution, at: Stopped, x0: State, implicit: bool, max_even
     if others and not written and not system.is_constrained and system.plan.held is None:
         return singular_mode(system, first, (t, x), inputs) + _of_short_circuits(system)
     written = written or others
+    gap = _gap_at_event(solution, at) if written else ""
+    if gap:
+        return stopped + gap
     if written:
         return f"{stopped}an event gave {written} a value that is not finite" + (
             ", or it entered a mode whose constraint does not hold at that instant (its gap or speed is not zero), or "
@@ -160,7 +164,7 @@ def _of_event(solution: Solution, at: Stopped, max_events: int) -> str:
     if at.result == TOO_MANY:
         return _too_many_events(solution.events, max_events, t)
     if at.result == STUCK:
-        return _stuck(solution, int(log.stuck), t, MOVED * float(resolution(at.t0, at.t1)))
+        return _stuck(solution, int(log.stuck), at)
     return _clash(solution, int(log.stuck), t) if at.result == CLASH else ""
 
 
@@ -183,6 +187,32 @@ def mode_at_start(system: AcausalSystem, inputs: Inputs, t0: Time, x0: State) ->
     return (
         f"the run cannot begin at t={float(t0):g} in the mode of " + "; ".join(lines) + ". Give starts at which these "
         "are zero, or begin in the other mode"
+    )
+
+
+def _gap_at_event(solution: Solution, at: Stopped) -> str:
+    """Names the constraints of modes that the last event entered though they do not hold where it happened, and by how
+    much; "" if all of them hold or it is not known what was before."""
+    system, inputs, log, t = solution.system, solution.inputs, solution.event_log, float(at.t)
+    held, n = system.plan.held, len(system.plan.nominal)
+    last = 0 if log is None else int(log.count) - 1
+    if held is None or log is None or not 0 <= last < len(log.before):
+        return ""
+    x, q = log.before[last][:n], log.before[last][n:]
+    at_once = abs(float(log.ts[last]) - t) <= MOVED * float(resolution(at.t0, at.t1))
+    if not at_once or not np.isfinite(np.asarray(x)).all():
+        return ""
+    begun = np.asarray(system.at(t, inputs).held(x)[0]) > np.asarray(system.holding(q).at(t, inputs).held(x)[0])
+    levels = np.asarray(system.at(t, inputs).held(x)[1])
+    gaps = {k: float(levels[held.table.owner == k][0]) for k in np.flatnonzero(begun).tolist()}
+    size = CONSISTENT * float(np.max(np.abs(np.asarray(x)[: len(system.plan.states)]), initial=1.0))
+    lines = [f"'{held.table.text[k]}', where it is {gap:.3g}" for k, gap in gaps.items() if abs(gap) > size]
+    if not lines:
+        return ""
+    return (
+        f"'{solution.events.names[-1]}' began a mode whose constraint does not hold there: {some(lines)}. No impulse "
+        "closes a gap. Let the mode begin where the constraint holds, with that as the event's condition, or write the "
+        "states with reinit(...)"
     )
 
 
@@ -232,11 +262,14 @@ def _too_many_events(events: Events, max_events: int, t: float) -> str:
     return f"{text}."
 
 
-def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
-    """Says why event number `event` happens, or its relation turns, again and again at t, an instant of that length."""
-    table = solution.system.plan.some_events
+def _stuck(solution: Solution, event: int, at: Stopped) -> str:
+    """Says why event number `event` happens, or its relation turns, again and again at one instant."""
+    t, instant = float(at.t), MOVED * float(resolution(at.t0, at.t1))
+    system, inputs = solution.system, solution.inputs
+    table = system.plan.some_events
     if EventFlag.RELATION in table.table.events[event].flags:
-        return _sliding(table.table.events[event], t)
+        together = turning_in_turn(system, event, (at.t, at.y), abs(float(at.t1 - at.t0)), inputs)
+        return _in_turn([table.table.events[k] for k in together], t) or _sliding(table.table.events[event], t)
     if EventFlag.REPEATED in table.table.events[event].flags:
         unsettled = _unsettled(solution, t)
         if unsettled:
@@ -261,6 +294,16 @@ def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
         return (
             f"{text}: what one of them writes makes the other one's condition true at once. Let the conditions for "
             f"switching on and off lie apart (hysteresis). {REST}"
+        )
+    same = writes_what_holds(system, event, (at.t, at.y), inputs)
+    if same:
+        name, value = same[0]
+        short = name.split(".", 1)[-1]
+        return (
+            f"the integration stopped at t={t:.6g}: {listed(names)} would happen again and again there, and change "
+            f"nothing: {some([f'{n} = {v:g}' for n, v in same])} holds already, and the equations of this mode keep "
+            f"the condition on the verge of being true. Let it count in the other mode only, "
+            f"when(…, on=Ne({short}, {value:g}))"
         )
     return (
         f"{text}: what it writes leaves its condition on the verge of being true, and the equations make it true at "
@@ -332,6 +375,20 @@ def _of_kinks(system: AcausalSystem) -> str:
     return (
         f". If it is a constraint that has a kink where a relation turns ({shown}), speeds jump there: round the kink, "
         "or say with self.complementary what pushes"
+    )
+
+
+def _in_turn(relations: list[Event], t: float) -> str:
+    """Explains relations that turn one after the other, ever faster; "" if there are none."""
+    if not relations:
+        return ""
+    which = "; ".join(f"'{e.condition}' of component '{e.owner}'" for e in relations)
+    return (
+        f"the integration stopped at t={t:.6g}: relations turn one after the other, ever faster (Zeno behaviour): "
+        f"{which}. The solution comes to where all of them are equal, and is driven back to none of these surfaces by "
+        f"itself. What it does from there on the equations leave open: end the run before, with "
+        "when(…, terminate(…)), let an event assign a mode in which it rests, or round the corner with a smooth law, "
+        "for instance tanh(x/small) instead of sign(x)"
     )
 
 

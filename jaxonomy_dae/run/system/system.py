@@ -23,6 +23,7 @@ from ...host.cache import compiled
 from ...host.platform import precisely
 from ...host.staging import is_staged, is_traced, joined, on_device, picked
 from ...solve.linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
+from ...solve.methods.steep_rest import without_idle_roots
 from .bounds import constrained, unconstrained
 from .input_values import check_given
 from .inputs import check_range, read_inputs
@@ -335,6 +336,9 @@ class AcausalSystem(eqx.Module):
 
     def vector_field(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""
+        if self.plan.takes_roots and not len(self.plan.carried):
+            # A point keeps what it has computed, which must not leave the branch in which it was.
+            return without_idle_roots(lambda y: self.at(t, args).vector_field(y), x)
         return self.at(t, args).vector_field(x)
 
     def semi_explicit(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
@@ -571,6 +575,9 @@ class AcausalSystem(eqx.Module):
         *,
         outputs: Sequence[str] | None = None,
         parameters: Sequence[str] | str = "all",
+        fmi: int = 3,
+        arrays: bool = False,
+        dae: bool = False,
         kinds: Sequence[str] | None = None,
         platforms: Sequence[str] | str | None = None,
         stop_time: float = 1.0,
@@ -582,8 +589,8 @@ class AcausalSystem(eqx.Module):
         from ...fmi.export import export_fmu
 
         return export_fmu(
-            self, path, outputs=outputs, parameters=parameters, kinds=kinds, platforms=platforms,
-            stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
+            self, path, outputs=outputs, parameters=parameters, fmi=fmi, arrays=arrays, dae=dae, kinds=kinds,
+            platforms=platforms, stop_time=stop_time, tolerance=tolerance, overwrite=overwrite,
         )  # fmt: skip
 
     def to_c(
@@ -603,6 +610,13 @@ class AcausalSystem(eqx.Module):
             self, path, outputs=outputs, functions=functions, stop_time=stop_time, tolerance=tolerance,
             overwrite=overwrite,
         )  # fmt: skip
+
+    def to_casadi(self, *, outputs: Sequence[str] | None = None) -> Any:
+        """This system as a `casadi.Function` of time, states, algebraic unknowns, discrete values, parameters and
+        inputs: see `jaxonomy_dae.fmi.to_casadi`, which has the same argument."""
+        from ...fmi.to_casadi import to_casadi
+
+        return to_casadi(self, outputs=outputs)
 
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
         if isinstance(solve_for, str):

@@ -385,10 +385,10 @@ class SystemAt:
     # --- events ------------------------------------------------------------------------------------------------
 
     @traced_once
-    def guards(self, x: Array) -> Array:
+    def guards(self, x: Array, refine: Refinement = Refinement.ONCE) -> Array:
         """The guards of all events of conditions, shape (guards,)."""
         events = self._events()
-        evaluation = self.run(events.guards, x, Refinement.ONCE)
+        evaluation = self.run(events.guards, x, refine)
         return self._filled(evaluation, events.guard)
 
     @traced_once
@@ -450,10 +450,12 @@ class SystemAt:
 
     # --- reading -----------------------------------------------------------------------------------------------
 
-    def quantities(self, x: Array, quantity: np.ndarray, factor: np.ndarray) -> Array:
+    def quantities(
+        self, x: Array, quantity: np.ndarray, factor: np.ndarray, refine: Refinement = Refinement.ROOT
+    ) -> Array:
         """The values of quantities with factors, shape (len(quantity),)."""
         program = self.plan.reading(quantity)
-        return self._filled(self.run(program, x, Refinement.ROOT), program.layout.gather(quantity, factor))
+        return self._filled(self.run(program, x, refine), program.layout.gather(quantity, factor))
 
 
 def _sum(terms: list[Array], zero: Array | float) -> Array | float:
