@@ -394,3 +394,11 @@ end Bank;
     new = with_single_connections(Sources([tmp_path]), source)
     loop = "for k__ in 1:size(on, 1) loop connect(on[k__], switch[k__].on); end for;"
     assert new == source.replace("connect(on, switch.on);", loop)
+
+
+def test_a_size_without_a_value_is_asked_for():
+    text = "model Bank parameter Integer n; Real x[n]; equation x = fill(time, n); end Bank;"
+    with pytest.raises(ModelError, match=r"gives no value to 'n', which decides its equations: component\(…, n=…\)"):
+        component("Bank", source=text)
+    declared = component("Bank", source=text, n=2).opened.flat.model.declarations
+    assert [d.name for d in declared] == ["n", "x[1]", "x[2]"]

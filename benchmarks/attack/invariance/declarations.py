@@ -220,6 +220,17 @@ def slides(surface: float = 1.0, above: float = 1.0, below: float = 1.0, **given
     return write
 
 
+def switch(value: Callable = lambda x: x < 0.5, place: int = 0) -> Callable:
+    """A discrete variable that an equation determines, beside another one that nothing changes."""
+
+    def write(self):
+        x, both = self.variable("x", start=1.0, fixed=True), [self.discrete("on"), self.discrete("other")]
+        self.add_equations(Eq(der(x), -x * (1 + sum(both))))
+        self.discrete_equation(both[place], value(x))
+
+    return write
+
+
 def array(shape: Any = 2, **changed: Any) -> Callable:
     class Cell(Component):
         def __init__(self, ev, name, k=1.0, start=1.0):
@@ -319,6 +330,8 @@ PAIRS: dict[str, tuple[tuple[Any, Any], str]] = {
     "declare_root.port": (pair(tree, root=Two(0, 1)), NOTHING),  # nothing is connected here
     "declare_branch.a": (pair(tree, a=Two(0, 1)), NOTHING),
     "declare_branch.b": (pair(tree, b=Two(2, 1)), NOTHING),
+    "discrete_equation.variable": (pair(switch, place=Two(0, 1)), STRUCTURE),
+    "discrete_equation.value": (pair(switch, Two(lambda x: x < 0.5, lambda x: x > 0.5)), STRUCTURE),
     "sliding.surface": (pair(slides, surface=Two(1.0, 2.0)), STRUCTURE),
     "sliding.above": (pair(slides, above=Two(1.0, 2.0)), STRUCTURE),
     "sliding.below": (pair(slides, below=Two(1.0, 2.0)), STRUCTURE),

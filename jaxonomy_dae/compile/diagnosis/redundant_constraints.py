@@ -250,6 +250,7 @@ def _behind(at: ModelAt, equations: np.ndarray, weight: np.ndarray) -> tuple[tup
             wanted.setdefault((one.component, one.statement), []).append(w)
             names.add(one.component)
     demand = _demands(at, wanted)
+    # Many joints are in no constraint any more: alias elimination has removed their equations.
     names |= _ties(flat, at.model.alias, demand)
     ports = np.unique(flat.variables.port[list(demand)]) if demand else np.zeros(0, np.int64)
     domains = {flat.ports.domains[p] for p in ports.tolist() if p >= 0}

@@ -73,6 +73,8 @@ def check_structure(
             )
             if mechanical:
                 texts.append(mechanical)
+                # Flows that redundant constraints leave open are the same fault: they are not reported as missing
+                # equations too.
                 under = [one for one in under if not _only_through(flat, np.isin(alias.root, unknown[one[1]]))]
                 continue
             best = _best(flat, alias, unknown, columns).tolist()
@@ -142,6 +144,7 @@ def _repeated(flat: FlatModel, empty: list[Provenance]) -> list[str]:
     column = np.cumsum(~flat.variables.is_input) - 1
     column[flat.variables.is_input] = -1
     unknown = np.flatnonzero(~flat.variables.is_input)
+    # The equations as written: in those that alias elimination has emptied, nothing tells which others they repeat.
     whole = incidence(flat.groups, column, len(unknown))
     over, _ = dulmage_mendelsohn(whole, maximum_matching(whole.pointer, whole.variable, whole.n_variables))
     texts = []

@@ -65,6 +65,8 @@ def _compared(
     guard = variables.quantity[table.guard[table.event[rows]]]
     own = parameter[rows][guard != ZERO]
     guard = guard[guard != ZERO]
+    # The guard of x > y is a variable of its own, x − y: what its equation reads is compared. That of x > 0 is x
+    # itself, and no equation is looked for.
     parameters, quantities = [own], [guard]
     for step in steps:
         if not isinstance(step, Step) or len(step.unknown) != 1:

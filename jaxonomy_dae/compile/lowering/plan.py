@@ -49,6 +49,7 @@ def nonlinear_blocks(
     found: list[DummyBlocks] = []
     start = 0
     for step in steps:
+        # Other steps compute their unknowns exactly where they stand: they have no places in g and z.
         if not step.carried:
             continue
         chosen = holds(step)
@@ -339,6 +340,7 @@ class SystemPlan:
             return None
         order = np.argsort(table.variables)
         found = order[np.minimum(np.searchsorted(table.variables, ids, sorter=order), len(order) - 1)]
+        # The search gives a place for any id. An array of variables that are no inputs is told by what stands there.
         return found if np.array_equal(table.variables[found], ids) else None
 
     def resolve(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -234,6 +234,7 @@ def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
         sorter: graphlib.TopologicalSorter[int] = graphlib.TopologicalSorter({e: () for e in events})
         readers = [e for e in events if reads[e]]
         for e in readers:
+            # What an event reads and writes itself, as a counter does, orders nothing.
             sorter.add(e, *sorted({k for read in reads[e] for k in writers.get(read, ()) if k != e and k in events}))
         return list(sorter.static_order())
 

@@ -50,6 +50,7 @@ class ArrayNames:
     def _parts(self, name: str) -> Iterator[tuple[ArrayEntry, list[str], str]]:
         """The components that a name may begin with: (the component, its path in the name, what follows)."""
         pieces = name.split(".") if self.entries else []
+        # Each cut is tried: an own name may have points too, as those of a port's variables have.
         for cut in range(len(pieces) - 1, 0, -1):
             entry = self.entries.get(".".join(p.partition("[")[0] for p in pieces[:cut]))
             if entry is not None:
@@ -66,6 +67,7 @@ class ArrayNames:
                 found = ids.reshape(entry.shape)[index]
             except IndexError:
                 continue
+            # With all its indices it is the name of one variable, which the table of variables has.
             return found if found.ndim else None
         return None
 

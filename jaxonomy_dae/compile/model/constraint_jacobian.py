@@ -31,6 +31,7 @@ class ConstraintEntries(Columns):
 def constraint_entries(groups: tuple[EquationGroup, ...], extended: Extended) -> ConstraintEntries:
     """All entries of the Jacobian."""
     quantities = extended.quantities
+    # The extended equations hold each equation once for every level, from 0 to c.
     c = np.bincount(extended.base) - 1
     first = equation_offsets(groups)
     out: list[list[np.ndarray]] = [[] for _ in range(6)]

@@ -29,6 +29,7 @@ class Kernel:
     def __init__(self, roots: Sequence[Node], labels: Sequence[Hashable]):
         position = {label: k for k, label in enumerate(labels)}
         guard = guards(roots)
+        # The conditions of a guarded node come before it, though they are no arguments of it.
         order = postorder(roots, lambda node: before(node, guard))
         place = {n: k for k, n in enumerate(order)}
         self.leaves = [(place[n], position[n.data]) for n in order if n.operation == "leaf"]

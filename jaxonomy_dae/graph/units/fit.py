@@ -134,6 +134,7 @@ class _Walk:
                 terms.append(Term(lambda: str(start), UnitOfValue(NUMBER, is_constant=True), float(start)))
             return self.agree(terms, ONE_UNIT["sum"], is_zero)
         if operation == "product":
+            # The exponent 0.3333333333333333 is meant as 1/3.
             return self._product(node, inside, [Fraction(e).limit_denominator(10**6) for e in node.data])
         if operation == "power":
             self._needs_number(node.arguments[1], "an exponent is a number")

@@ -90,6 +90,8 @@ def equation_not_finite(system: AcausalSystem, inputs: Inputs, t: Time, x: State
         own = np.zeros(len(values), bool)
         own[np.concatenate(step.unknown)] = True
         for equation in step.equations:
+            # The unknowns of a step that failed are not finite, whichever equation is to blame: each is asked with ANY
+            # in their place.
             known = (finite | own)[equation.quantity].all(axis=1)
             wrong = ~np.isfinite(equation.residual(at)) & known
             if wrong.any():
@@ -104,6 +106,7 @@ def end_of_domain(system: AcausalSystem, t: Time, x: State, t1: Time, inputs: In
     slope = np.asarray(consistent_slope(problem, None, jnp.asarray(t), jnp.asarray(x)))
     if not np.isfinite(slope).all():
         return ""
+    # From the nearest point on: farther away other equations fail as well, and may come first.
     for part in NEAR:
         dt = part * float(t1 - t)
         found = equation_not_finite(system, inputs, t + dt, np.asarray(x) + dt * slope)

@@ -122,6 +122,7 @@ class AcausalCompiler:
         model = compile_flat(flat, self.state_selection, self.prefer_states)
         plan = lower(model, self.linear_solver)
         table, declared = flat.parameters, flat.declares
+        # The plan holds no values: it is a key of compiled programs, which serve all values.
         self._report, self._passes = SystemReport(plan, declared.values), Passes(plan, added)
         n = table.n_declared
         names = ParameterNames(

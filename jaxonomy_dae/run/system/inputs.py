@@ -293,6 +293,7 @@ def check_range(inputs: Mapping[str, Any], t0: Any, t1: Any):
         if not isinstance(value, SampledInput) or is_traced(value.path.ts):
             continue
         first, last = float(value.path.ts[0]), float(value.path.ts[-1])
+        # An instant has no length by which samples may miss its ends: that of the samples stands for it.
         if not _reach_over(value, float(t0), float(t1), last - first if t0 == t1 else t1 - t0):
             if t0 == t1:
                 raise ModelError(
@@ -351,6 +352,7 @@ def step_ends(plan: SystemPlan, inputs: Mapping[str, Any]) -> StepEnds:
                 f"the model differentiates input '{name}' {_times(highest)}: {kind} samples do not have that "
                 f"derivative at their times. Give {better}"
             )
+        # Of samples, the derivative of order smoothness + 1 is the first that jumps.
         (ends.jumps if highest > value.smoothness else ends.kinks).append(value.path.ts)
     return ends
 

@@ -61,6 +61,7 @@ class _AbstractDirect(lx.AbstractLinearSolver[_State]):
         del options
         x = self._solved(state, ravel_pytree(vector)[0])
         like = state.range if state.transposed else state.domain
+        # Lineax itself calls the operator singular if the solution is not finite (lineax/_solve.py).
         return ravel_pytree(like)[1](x), lx.RESULTS.successful, {}
 
     def transpose(self, state: _State, options: dict[str, Any]) -> tuple[_State, dict[str, Any]]:

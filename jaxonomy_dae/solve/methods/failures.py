@@ -111,6 +111,8 @@ def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
     """The names of unknowns that a singular matrix leaves undetermined; "" if it is regular."""
     if not np.isfinite(matrix).all():
         return ""
+    # Rows and columns have their own units. An equation in pascals beside one in metres would make a regular matrix
+    # look singular.
     rows = np.abs(matrix).max(axis=1)
     columns = np.abs(matrix / np.where(rows == 0, 1, rows)[:, None]).max(axis=0)
     scaled = matrix / np.where(rows == 0, 1, rows)[:, None] / np.where(columns == 0, 1, columns)[None, :]

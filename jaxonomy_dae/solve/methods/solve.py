@@ -246,6 +246,7 @@ def _solve(of: _Given, checked: bool = False):
     # The end of the last step is on the constraints already: the methods are stiffly accurate.
     saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
     saved = jax.tree.map(lambda y: not_a_number(y, reached, y0, args), saved)
+    # Diffrax has no code of its own for an inconsistent start.
     failure: Result = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(check.is_fine, run.result, failure)
     out = diffrax.Solution(
@@ -302,6 +303,8 @@ def consistent_start(
     t = jnp.asarray(t0, problem.flat.dtype)
     y, size = consistent_point(problem, None, t, problem.flat, max_steps)
     eps = float(jnp.finfo(y.dtype).eps)
+    # Newton's method converges quadratically: after a step of √ε the error is some ε. Negated, so that a size that is
+    # not a number counts as failed.
     failed = ~(size <= math.sqrt(eps))
     traced = is_traced(failed)
     if throw is False or (traced and throw is None):
