@@ -65,7 +65,9 @@ class Described:
         self.states = [v.derivative.name for v in of_states]
         scalars = [v for v in description.modelVariables if not v.dimensions]
         reals = [v for v in scalars if v.type in REALS]
-        self.inputs = [v.name for v in reals if v.causality == "input"]
+        # Discrete inputs may be set at events only: they keep the values that they start with.
+        moving = [v for v in reals if v.variability in (None, "continuous")]
+        self.inputs = [v.name for v in moving if v.causality == "input"]
         self.outputs = [v.name for v in scalars if v.causality == "output" and v.type in (*REALS, *TRUTHS, *WHOLE)]
         self.parameters = [v.name for v in reals if v.causality == "parameter"]
         self.time = next((v.name for v in description.modelVariables if v.causality == "independent"), "")
