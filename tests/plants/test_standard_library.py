@@ -287,6 +287,35 @@ def test_a_quasi_static_circuit(library):
         assert slopes[name] == pytest.approx(float(expected), rel=1e-7), name
 
 
+def test_sums_and_sines_of_complex_signals(library):
+    """y = k1 u1 + k2 u2, and sin(u), of our signals, beside Python's complex numbers."""
+    ev, d, blocks = EqnEnv(), AcausalDiagram(), "ComplexBlocks.ComplexMath"
+    gains = {"k1.re": 0.5, "k1.im": 0.25, "k2.re": -1.5, "k2.im": 2.0}
+    add, sine = opened(library, f"{blocks}.Add")(ev, "add", **gains), opened(library, f"{blocks}.Sin")(ev, "sine")
+    inputs = {"u1.re": 0.7, "u1.im": -0.2, "u2.re": 1.1, "u2.im": 0.4}
+    signals = [Constant(ev, f"c{k}", value) for k, value in enumerate(inputs.values())]
+    d.add(add, sine, *signals)
+    for signal, name in zip(signals, inputs, strict=True):
+        d.connect(signal, "y", add, name)
+    d.connect(signals[2], "y", sine, "u.re")
+    d.connect(signals[3], "y", sine, "u.im")
+    system = AcausalCompiler(ev, d)()
+    values = {f"add.{name}": value for name, value in gains.items()} | {
+        f"c{k}.k": v for k, v in enumerate([1.1, 0.4], 2)
+    }
+    order, names = list(values), ["add.y.re", "add.y.im", "sine.y.re", "sine.y.im"]
+    found, slopes = run_with_slopes(system, values, [0.1, 0.2], names, names)
+
+    def outputs(values):
+        a, b, c, e, x, y = (values[name] for name in order)
+        total, turned = (a + 1j * b) * (0.7 - 0.2j) + (c + 1j * e) * (x + 1j * y), jnp.sin(x + 1j * y)
+        return jnp.stack([total.real, total.imag, turned.real, turned.imag])
+
+    np.testing.assert_allclose([found[n] for n in names], np.tile(outputs(values)[:, None], 2), rtol=1e-12)
+    for name, expected in jax.grad(lambda p: jnp.sum(outputs(p)))(values).items():
+        assert slopes[name] == pytest.approx(float(expected), rel=1e-10), name
+
+
 ARM = """
 model Arm "a body on a revolute joint; its shaft is open"
   inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false, n = {0, -1, 0});
