@@ -402,3 +402,22 @@ def test_a_size_without_a_value_is_asked_for():
         component("Bank", source=text)
     declared = component("Bank", source=text, n=2).opened.flat.model.declarations
     assert [d.name for d in declared] == ["n", "x[1]", "x[2]"]
+
+
+def test_parameters_that_decide_equations_are_not_symbols():
+    """The loss of a lossless gear: `ideal` was known to the front end, which chose equations by it, and other losses
+    were taken and had no effect."""
+    text = """model Gear
+  parameter Real loss = 0;
+  parameter Real ratio = 2;
+  Boolean ideal;
+  Boolean simple = not ideal;
+  Real y;
+equation
+  ideal = loss == 0;
+  if ideal then y = ratio * time; else y = (1 - loss) * ratio * time; end if;
+end Gear;"""
+    Gear = component("Gear", source=text)
+    assert Gear.opened.tunable == ("ratio",)
+    with pytest.raises(ModelError, match=r"'loss' decides the equations .* give it when the class is opened"):
+        Gear(EqnEnv(), "g", loss=0.5)
