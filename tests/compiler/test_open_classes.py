@@ -414,7 +414,7 @@ def test_parameters_that_decide_equations_are_not_symbols():
   Boolean simple = not ideal;
   Real y;
 equation
-  ideal = loss == 0;
+  ideal = loss <= 0;
   if ideal then y = ratio * time; else y = (1 - loss) * ratio * time; end if;
 end Gear;"""
     Gear = component("Gear", source=text)
