@@ -58,8 +58,17 @@ GIVEN = {  # modifications of classes whose names begin so: the first that fits
     "Modelica.Blocks.MathBoolean.": "nu = 2",
     "Modelica.Blocks.MathInteger.": "nu = 2",
 }
-# What the front end says where a parameter without a value decides the equations.
-_DECIDES = re.compile(r"not parameter-evaluable: unknown variable: (\w+)|unresolved component dimension for \w+: (\w+)")
+_HEAD = """# Classes of the Modelica library
+
+Classes of the Modelica Standard Library 4.1.0 that have connectors, as components with open ports
+([how](../how-to/modelica.md#take-components-of-a-library)). A class is *opened* if the front end flattens it with
+open connectors, *translated* if its equations become those of a component, and *compiled* if a plant of the component
+and its boundaries compiles: it then has as many equations as unknowns. Parameters without a value are 1.
+
+`python -m benchmarks.modelica_classes` makes this page from a checkout of the library. Its random order has each
+package in proportion, however many classes are tried.
+"""
+_DECIDES = re.compile(r"gives no value to '(\w+)', which decides")  # what the front end says
 
 
 class Boundaries(Component):
@@ -228,7 +237,7 @@ def _opened(library: Library, name: str, given: list[str]) -> OpenClass:
         return library.opened(name, ", ".join(filter(None, given)))
     except ModelError as error:
         unknown = _DECIDES.search(str(error))
-        value = f"{unknown[1] or unknown[2]} = 1" if unknown else ""
+        value = f"{unknown[1]} = 1" if unknown else ""
         if not value or value in given:
             raise
     return _opened(library, name, [*given, value])
@@ -261,9 +270,10 @@ def _page(rows: list[dict], all_of_them: int, seed: int | None) -> str:
     for row in rows:
         of[_package(row["class"])].append(row)
     lines = [
+        _HEAD,
         f"{len(rows) + len(partial) + len(bare)} classes of {all_of_them}"
         + (f", drawn with the seed {seed}" if seed is not None else "")
-        + f"; {len(partial)} of them are partial and {len(bare)} have no connectors.",
+        + f". Partial: {len(partial)}; without connectors: {len(bare)}; both are left out below.",
         "",
         "| package | classes | opened | translated | compiled |",
         "|---|---|---|---|---|",

@@ -185,6 +185,7 @@ MAY_BE_SKIPPED = (
     r"this processor does not run OpenBLAS' kernels",
     r"could not import 'casadi'",  # an extra of the benchmarks
     r"MODELICA_LIBRARY does not name the folder",  # the Modelica Standard Library, which is not part of the repository
+    r"REFERENCE_FMUS does not name the sources",  # FMUs of the Modelica Association
     r"no mappings are counted here",  # outside of Linux
 )
 

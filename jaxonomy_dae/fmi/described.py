@@ -18,6 +18,15 @@ REALS, TRUTHS = ("Float64", "Real"), ("Boolean",)
 WHOLE = ("Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Integer", "Enumeration")
 
 
+def _version(path: Path, where: str) -> str:
+    """The version of FMI that a file says it is of, read before FMPy reads it by the rules of that version."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return ElementTree.fromstring(file.read("modelDescription.xml")).get("fmiVersion", "none")
+    except (zipfile.BadZipFile, KeyError, ElementTree.ParseError) as error:
+        raise ModelError(f"{where}'{path.name}' is no FMU: its modelDescription.xml cannot be read") from error
+
+
 class Described:
     """An FMU's file, unpacked. `states`, `slopes`, `inputs`, `outputs` and `parameters` are names of scalars.
 
@@ -33,9 +42,10 @@ class Described:
         if not path.is_file():
             raise ModelError(f"{where}there is no file '{path}'")
         self.where, self.path = where, path
+        version = _version(path, where)
+        if version not in ("2.0", "3.0"):
+            raise ModelError(f"{where}'{path.name}' is of FMI {version}: export it for FMI 3.0 or 2.0")
         self.text = description = fmpy.read_model_description(str(path))
-        if description.fmiVersion not in ("2.0", "3.0"):
-            raise ModelError(f"{where}'{path.name}' is of FMI {description.fmiVersion}: export it for FMI 3.0 or 2.0")
         self.version = int(float(description.fmiVersion))
         if description.modelExchange is None:
             raise ModelError(f"{where}'{path.name}' has no Model Exchange: export it with it")
@@ -65,7 +75,9 @@ class Described:
         self.states = [v.derivative.name for v in of_states]
         scalars = [v for v in description.modelVariables if not v.dimensions]
         reals = [v for v in scalars if v.type in REALS]
-        self.inputs = [v.name for v in reals if v.causality == "input"]
+        # Discrete inputs may be set at events only: they keep the values that they start with.
+        moving = [v for v in reals if v.variability in (None, "continuous")]
+        self.inputs = [v.name for v in moving if v.causality == "input"]
         self.outputs = [v.name for v in scalars if v.causality == "output" and v.type in (*REALS, *TRUTHS, *WHOLE)]
         self.parameters = [v.name for v in reals if v.causality == "parameter"]
         self.time = next((v.name for v in description.modelVariables if v.causality == "independent"), "")

@@ -324,7 +324,21 @@ class Programs:
             "step": (self.step, (*point, number, *weights)),
             "accept": (self.accept, (*point, *memory, number, *weights)),
         }
-        return {name: jax.make_jaxpr(given[name][0])(*given[name][1]) for name in self.names}
+        return {name: _program_of(*given[name]) for name in self.names}
+
+
+def _program_of(function: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+    """A function as a program; where JAX cannot differentiate a call of the host in it, that is what stands in the way
+    of C code, too."""
+    try:
+        return jax.make_jaxpr(function)(*given)
+    except ValueError as error:
+        if "callback" not in str(error):
+            raise
+        raise ModelError(
+            "a function of this model calls the host (jax.pure_callback or io_callback), which C code cannot: write it "
+            "with jax.numpy"
+        ) from error
 
 
 def _given_at_start(system: AcausalSystem) -> np.ndarray:

@@ -22,12 +22,12 @@ def write_assertion(scope: Scope, call: Call) -> None:
 
     - `ModelError` for one that is violated whatever happens.
     """
-    named = dict(call.named)
-    level = named.get("level", call.arguments[2] if len(call.arguments) > 2 else None)
+    condition, text, *others = call.arguments
+    level = dict(call.named).get("level", others[0] if others else None)
     if isinstance(level, Reference) and level.path.endswith("warning"):
         return
-    holds = scope.evaluate(call.arguments[0])
-    message = f"an assertion is violated: {_text(scope, call.arguments[1])}"
+    holds = scope.evaluate(condition)
+    message = f"an assertion is violated: {_text(scope, text)}"
     if holds is False:
         raise ModelError(message)
     if not isinstance(holds, sympy.Basic):

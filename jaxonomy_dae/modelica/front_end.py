@@ -17,6 +17,9 @@ _PLACE = re.compile(r"× (?P<what>[^\n]*)\s+╭─\[[^\]]*?:(?P<line>\d+):(?P<co
 _UNRESOLVED = re.compile(r"unresolved (type reference|function call|component reference|[\w ]+): '([^']+)'")
 _UNBALANCED = re.compile(r"unbalanced model: (\d+) equations, (\d+) unknowns")
 _UNROOTED = re.compile(r"Connections\.branch\(([^,]+), [^)]+\) belongs to a virtual connection graph component with no")
+_DECIDES = re.compile(
+    r"not parameter-evaluable: unknown variable: ([\w.]+)|unresolved component dimension for [\w.]+: (\w+)"
+)
 _CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")
 
 
@@ -104,8 +107,8 @@ class FrontEnd:
 
     def _said(self, text: str, model: str | None, error: str) -> str:
         """What rumoca found wrong, with its place."""
-        found = [d.message for d in self.rumoca.validate_source(text, model=model) if d.rule == "syntax-error"]
-        if place := _PLACE.search("\n".join(found)):
+        wrong = [d.message for d in self.rumoca.validate_source(text, model=model) if d.rule == "syntax-error"]
+        if place := _PLACE.search("\n".join(wrong)):
             return f"Modelica, line {place['line']}, column {place['column']}: {place['what'].strip()}"
         unresolved = sorted(
             (m.groups() for m in _UNRESOLVED.finditer(error)), key=lambda each: each[0] != "type reference"
@@ -125,6 +128,9 @@ class FrontEnd:
             which = "are too many" if equations > unknowns else "lack one"
             counts = f"{_count(equations, 'equation')} for {_count(unknowns, 'unknown')}"
             return f"'{model or last}' has {counts}; rumoca does not say which of them {which}"
+        if found := _DECIDES.search(error):
+            name = found[1] or found[2]
+            return f"the class gives no value to '{name}', which decides its equations: component(…, {name}=…)"
         return f"rumoca {self.rumoca.version()}: {error}"
 
 

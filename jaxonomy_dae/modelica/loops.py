@@ -20,7 +20,7 @@ from .values import Record, Value, as_number, is_condition
 MOST = 256  # rounds; iterations of media functions take up to a hundred
 JUMPS = ("return", "break")
 
-Path = tuple[str | int, ...]
+Path = tuple[str, *tuple[str | int, ...]]
 
 
 class Carried(NamedTuple):

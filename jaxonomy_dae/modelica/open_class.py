@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ..base.errors import ModelError
+from . import tree
 from .boundaries import Closed, without_boundaries
 from .external_objects import with_external_objects
 from .flat_model import FlatModel
@@ -100,10 +101,43 @@ def opened(name: str, closed: Closed) -> OpenClass:
             if at["causality"] == "input":  # those that the class binds are its own variables
                 names = [n for n in names if v["role"] == "input" and declared[n].value is None]
             roles.get(at["causality"], []).extend(names)
+    deciding = _deciding(flat.model, tunable)
+    tunable, fixed = [n for n in tunable if n not in deciding], [*fixed, *(n for n in tunable if n in deciding)]
+    required = [n for n in required if n not in deciding]
     return OpenClass(
         name, found.flat.get("model_description") or "", flat, ports, tuple(roles["input"]), tuple(roles["output"]),
         tuple(tunable), tuple(required), tuple(fixed), *_tree_of(ports, closed),
     )  # fmt: skip
+
+
+def _deciding(model: tree.Class, tunable: Sequence[str]) -> set[str]:
+    """The parameters among `tunable` that determine a Boolean or an Integer variable, with other parameters alone.
+
+    The front end knows such a variable, and decides by it which equations stand in the class: with the values that it
+    has then. Another value would belong to other equations: a `LossyGear` that was opened without losses has none.
+    """
+    discrete = {
+        d.name for d in model.declarations if d.type in ("Boolean", "Integer") and "parameter" not in d.prefixes
+    }
+    constant = {d.name for d in model.declarations if d.prefixes & {"parameter", "constant"}}
+    entries: dict[str, set[str]] = {}
+    for n in constant:
+        entries.setdefault(n.partition("[")[0], set()).add(n)
+    reads = {
+        e.left.path: {part.path for part in tree.each_part(e.right) if isinstance(part, tree.Reference)}
+        for e in model.equations
+        if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and e.left.path in discrete
+    }
+    known: dict[str, set[str]] = {}  # of variables that parameters determine: these parameters
+    while True:
+        found = {
+            name: set().union(*(known.get(r) or entries.get(r, set()) for r in read))
+            for name, read in reads.items()
+            if name not in known and all(r in known or r in entries for r in read)
+        }
+        if not found:
+            return set().union(*known.values()) & set(tunable)
+        known |= found
 
 
 def _tree_of(ports: Sequence[OpenPort], closed: Closed) -> tuple[tuple[tuple[str, str], ...], tuple[str, ...]]:

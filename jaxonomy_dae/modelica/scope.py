@@ -33,6 +33,7 @@ from .written_out import entries_of, unrolled
 REAL = "Real"
 _TEXTS = ("String", "StateSelect", "AssertionLevel")
 _CONSTANT = {"parameter", "constant"}
+_CLOCKED = ("Clock", "previous", "hold", "subSample", "superSample", "shiftSample", "backSample", "noClock")
 
 
 class Scope:
@@ -66,6 +67,7 @@ class Scope:
             "terminal": lambda: False, "sample": self._sample, "delay": _delay,
         }  # fmt: skip
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
+        special |= {name: functools.partial(_clocked, name) for name in _CLOCKED if name not in flat.classes}
         self.random = RandomNumbers(component)
         self.interpreter = Interpreter(
             flat.classes, self.value, special,
@@ -432,6 +434,13 @@ def located(model: str, line: int, do: Callable[..., T], *arguments: object) -> 
 
 def _delay(*_: Expression) -> Value:
     raise ModelError("delay(…) needs the past of a variable, which is not kept")
+
+
+def _clocked(name: str, *_: Expression) -> Value:
+    raise ModelError(
+        f"{name}(…) belongs to the synchronous language elements, chapter 16 of the specification, which are not "
+        "read: write sample(start, interval) in a when"
+    )
 
 
 def _gather(names: Iterable[str]) -> tuple[dict[str, list[tuple[int, ...]]], dict[str, list[str]]]:

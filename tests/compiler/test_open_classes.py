@@ -244,7 +244,7 @@ def test_classes_are_data(library, tmp_path):
         packed.component("Devices.Load", m=2)
     with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
         archive.writestr("A.json", json.dumps({"format": 0}))
-    with pytest.raises(ModelError, match=r"this is no class of format 3: it has format 0"):
+    with pytest.raises(ModelError, match=r"this is no class of format 4: it has format 0"):
         Library(tmp_path / "c.zip")["A"]
     (tmp_path / "d.zip").write_bytes(b"none")
     with pytest.raises(ModelError, match=r"'.*d.zip' is not a file of packed classes"):
@@ -394,3 +394,30 @@ end Bank;
     new = with_single_connections(Sources([tmp_path]), source)
     loop = "for k__ in 1:size(on, 1) loop connect(on[k__], switch[k__].on); end for;"
     assert new == source.replace("connect(on, switch.on);", loop)
+
+
+def test_a_size_without_a_value_is_asked_for():
+    text = "model Bank parameter Integer n; Real x[n]; equation x = fill(time, n); end Bank;"
+    with pytest.raises(ModelError, match=r"gives no value to 'n', which decides its equations: component\(…, n=…\)"):
+        component("Bank", source=text)
+    declared = component("Bank", source=text, n=2).opened.flat.model.declarations
+    assert [d.name for d in declared] == ["n", "x[1]", "x[2]"]
+
+
+def test_parameters_that_decide_equations_are_not_symbols():
+    """The loss of a lossless gear: `ideal` was known to the front end, which chose equations by it, and other losses
+    were taken and had no effect."""
+    text = """model Gear
+  parameter Real loss = 0;
+  parameter Real ratio = 2;
+  Boolean ideal;
+  Boolean simple = not ideal;
+  Real y;
+equation
+  ideal = loss <= 0;
+  if ideal then y = ratio * time; else y = (1 - loss) * ratio * time; end if;
+end Gear;"""
+    Gear = component("Gear", source=text)
+    assert Gear.opened.tunable == ("ratio",)
+    with pytest.raises(ModelError, match=r"'loss' decides the equations .* give it when the class is opened"):
+        Gear(EqnEnv(), "g", loss=0.5)

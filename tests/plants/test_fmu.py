@@ -205,6 +205,12 @@ def test_what_cannot_be_exported_is_refused_by_name(tmp_path, ball):
     with pytest.raises(ModelError, match=r"no C code for the JAX primitive 'igamma' .*test_fmu.py:\d+, in .*gamma"):
         export_fmu(compiled(Learned(EqnEnv(), "c", gamma)), tmp_path / "x.fmu")
 
+    def host(u):
+        return jax.pure_callback(np.sin, jax.ShapeDtypeStruct((), float), u)
+
+    with pytest.raises(ModelError, match="calls the host .* which C code cannot"):
+        export_fmu(compiled(Learned(EqnEnv(), "c", host)), tmp_path / "x.fmu")
+
 
 # --- derivatives ----------------------------------------------------------------------------------------------------
 

@@ -1,5 +1,7 @@
 """FMUs as components: runs and gradients beside closed forms."""
 
+import zipfile
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,6 +72,14 @@ def test_what_cannot_be_a_component_is_refused_by_name(decay, tmp_path):
     bare = compiled(Decay(EqnEnv(), "d")).export_fmu(tmp_path / "bare.fmu", kinds=["model_exchange"], platforms=())
     with pytest.raises(ModelError, match="has no binary for .*, only for none"):
         imported(bare)
+    other = tmp_path / "other.fmu"
+    with zipfile.ZipFile(other, "w") as file:
+        file.writestr("modelDescription.xml", '<fmiModelDescription fmiVersion="1.0"/>')
+    with pytest.raises(ModelError, match="'other.fmu' is of FMI 1.0: export it for FMI 3.0 or 2.0"):
+        imported(other)
+    other.write_text("none")
+    with pytest.raises(ModelError, match="'other.fmu' is no FMU"):
+        imported(other)
 
 
 @pytest.mark.slow

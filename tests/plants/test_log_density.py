@@ -129,7 +129,7 @@ def test_samples_of_one_skewed_parameter(bounds):
         kernel = blackjax.nuts(density, **tuned)
         keys = jax.random.split(jax.random.key(1), 4000)
         draws = jax.lax.scan(lambda s, key: (new := kernel.step(key, s)[0], new.position), state, keys)[1]
-        effective = float(blackjax.diagnostics.ess_bulk(draws[None])[0])
+        effective = float(jnp.ravel(blackjax.diagnostics.ess_bulk(draws[None]))[0])
     k = np.asarray(density.values(draws)["c.k"])
     assert effective > 400 and k.min() >= bounds[0] and k.max() <= bounds[1]
     grid, mass = by_quadrature(*np.log(bounds))

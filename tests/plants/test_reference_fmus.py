@@ -20,7 +20,7 @@ from fmus import fmpy
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning, simulate
 from jaxonomy_dae.fmi import FmuComponent
 from jaxonomy_dae.fmi.compilers import FLAGS, FOLDERS_OF_FMI_2, compiler_for, this_platform
-from jaxonomy_dae.library import thermal
+from jaxonomy_dae.library import signal, thermal
 
 SOURCES = os.environ.get("REFERENCE_FMUS", "")
 pytestmark = [
@@ -131,21 +131,18 @@ def test_van_der_pol_by_its_parameter(tmp_path):
     assert jax.grad(last)(1.0) == pytest.approx(expected, rel=1e-6)
 
 
-def test_robertsons_reactions(tmp_path):
-    """A stiff model, whose third species is an output: its two indicators pass zero at events that change nothing."""
-    _, system = imported(built("Roberts", 3, tmp_path))
-    ts = np.array([0.4, 4.0, 40.0])
-    run = simulate(system, 40.0, rtol=1e-9, atol=1e-13, ts=jnp.asarray(ts))
-
-    def slopes(t, y):
-        a, b = y
-        flow = 0.04 * a - 1e4 * b * (1 - a - b)
-        return [-flow, flow - 3e7 * b**2]
-
-    expected = scipy.integrate.solve_ivp(slopes, (0, 40), [1, 0], "Radau", ts, rtol=1e-12, atol=1e-15).y
-    np.testing.assert_allclose(run["f.y1"], expected[0], rtol=0, atol=1e-7)
-    np.testing.assert_allclose(run["f.y2"], expected[1], rtol=0, atol=1e-7)
-    np.testing.assert_allclose(run["f.y3"], 1 - expected.sum(axis=0), rtol=0, atol=1e-7)
+def test_a_signal_that_passes_through(tmp_path):
+    """An FMU without states between two lags: w' = 1 − w and v' = w − v, v = 1 − (1 + t)·exp(−t)."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    step, before, after = signal.Constant(ev, "step", k=1.0), *(signal.FirstOrder(ev, n, T=1.0) for n in ("w", "v"))
+    fmu = FmuComponent(ev, "f", built("Feedthrough", 3, tmp_path), parameters=[], outputs=["Float64_continuous_output"])
+    diagram.add(step, before, after, fmu)
+    diagram.connect(step.y, before.u)
+    diagram.connect(before, "y", fmu, "Float64_continuous_input")
+    diagram.connect(fmu, "Float64_continuous_output", after, "u")
+    ts = jnp.array([0.5, 2.0])
+    run = simulate(AcausalCompiler(ev, diagram)(), 2.0, rtol=1e-9, atol=1e-11, ts=ts)
+    np.testing.assert_allclose(run["v.y"], 1 - (1 + ts) * jnp.exp(-ts), rtol=0, atol=1e-7)
 
 
 def test_a_fit_around_an_fmu_of_others(tmp_path):

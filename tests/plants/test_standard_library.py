@@ -25,7 +25,7 @@ from jaxonomy_dae import (
     simulate,
 )
 from jaxonomy_dae.library import electrical, rotational, thermal, translational
-from jaxonomy_dae.library.signal import Constant
+from jaxonomy_dae.library.signal import Constant, Step
 from jaxonomy_dae.modelica import Library
 from jaxonomy_dae.solvers import Rodas5P
 
@@ -201,6 +201,119 @@ def test_inductors_transformers_and_radiation(library):
     assert found["cold.T"][-1] == pytest.approx(cold_at(0.01), rel=1e-9)
     by_Gr = (cold_at(0.02) - cold_at(0.0)) / 0.02
     assert slopes["radiation.Gr"] == pytest.approx(by_Gr, rel=1e-5)
+
+
+def test_an_inverter_a_thyristor_and_a_transformer(library):
+    """An inverter of two transistors charges our capacitor; a gate turn-off thyristor conducts after our step; both
+    windings of a transformer are loaded. Each by its equations in SciPy; slopes by differences."""
+    ev, d, analog = EqnEnv(), AcausalDiagram(), "Electrical.Analog"
+    n = opened(library, f"{analog}.Semiconductors.NMOS")(ev, "n")
+    p = opened(library, f"{analog}.Semiconductors.PMOS")(ev, "p")
+    gto = opened(library, f"{analog}.Ideal.IdealGTOThyristor")(ev, "gto", Ron=0.5, Goff=1e-3, Vknee=1.0)
+    Windings = opened(library, f"{analog}.Basic.Transformer")
+    windings = Windings(ev, "windings", start={"i1": 0.0, "i2": 0.0}, L1=0.02, L2=0.03, M=0.016)
+    supply, gate = electrical.VoltageSource(ev, "supply", V=5.0), electrical.VoltageSource(ev, "gate", V=2.0)
+    g, out = electrical.Ground(ev, "g"), electrical.Capacitor(ev, "out", C=1e-7, initial_voltage=0.0)
+    v, load = electrical.VoltageSource(ev, "v", V=10.0), electrical.Resistor(ev, "load", R=5.0)
+    r1, r2 = electrical.Resistor(ev, "r1", R=1.0), electrical.Resistor(ev, "r2", R=2.0)
+    fire = Step(ev, "fire", start_time=0.02)
+    d.add(n, p, gto, windings, supply, gate, g, out, v, load, r1, r2, fire)
+    d.connect(supply.p, p.S, p.B)
+    d.connect(gate.p, n.G, p.G)
+    d.connect(n.D, p.D, out.p)
+    d.connect(v.p, gto.p, r1.p)
+    d.connect(gto.n, load.p)
+    d.connect(fire.y, gto.fire)
+    d.connect(r1.n, windings.p1)
+    d.connect(windings.p2, r2.p)
+    d.connect(g.p, supply.n, gate.n, out.n, n.S, n.B, v.n, load.n, windings.n1, windings.n2, r2.n)
+    system = AcausalCompiler(ev, d)()
+    values = {"n.Beta": 0.041e-3, "p.Vt": -1.0, "gto.Ron": 0.5, "gto.Vknee": 1.0, "windings.M": 0.016}
+    ts = np.array([0.01, 0.03, 0.05])
+    names = ["out.v", "load.i", "r2.i"]
+    found, slopes = run_with_slopes(system, values, ts, names, names)
+
+    def runs(beta, threshold, Ron, knee, M):
+        def solved(slope, start):
+            return scipy.integrate.solve_ivp(slope, (0.0, 0.05), start, t_eval=ts, rtol=1e-10, atol=1e-12).y
+
+        def channel(gain, over, across):  # a transistor's current, for positive values
+            return gain * (across * (over - across / 2) if over > across else over**2 / 2) + 1e-7 * across
+
+        def charging(t, x):
+            down = channel(beta * 17.5 / 4.5, (2.0 - 0.8) * 0.7311, x[0])
+            up = channel(0.0105e-3 * 17.5 / 3.9, (3.0 + threshold) * 0.839, 5.0 - x[0])
+            return [(up - down) / 1e-7]
+
+        conducting = (10.0 - knee + Ron * 1e-3 * knee) / (5.0 + Ron)
+        thyristor = np.where(ts < 0.02, 10.0 * 1e-3 / (1.0 + 5.0 * 1e-3), conducting)
+        coupled = np.array([[0.02, M], [M, 0.03]])
+        winding = solved(lambda t, i: np.linalg.solve(coupled, [10.0 - i[0], -2.0 * i[1]]), [0.0, 0.0])
+        return np.array([solved(charging, [0.0])[0], thyristor, -winding[1]])
+
+    np.testing.assert_allclose([found[name] for name in names], runs(*values.values()), rtol=2e-6)
+    for name, value in values.items():
+        up, down = (runs(*(values | {name: value * (1 + s * 1e-4)}).values())[:, -1].sum() for s in (1, -1))
+        assert slopes[name] == pytest.approx((up - down) / (2e-4 * value), rel=1e-3), name
+
+
+def test_a_quasi_static_circuit(library):
+    """A phasor source on a resistor and a capacitor, whose capacity is our signal: I = V/(R + 1/(j omega C))."""
+    ev, d, phasors = EqnEnv(), AcausalDiagram(), "Electrical.QuasiStatic.SinglePhase"
+    source = opened(library, f"{phasors}.Sources.VoltageSource")(ev, "source", f=50.0, V=100.0, phi=0.3)
+    r = opened(library, f"{phasors}.Basic.Resistor")(ev, "r", R_ref=30.0)
+    c = opened(library, f"{phasors}.Basic.VariableCapacitor")(ev, "c")
+    ground, capacity = opened(library, f"{phasors}.Basic.Ground")(ev, "ground"), Constant(ev, "capacity", 1e-4)
+    d.add(source, r, c, ground, capacity)
+    d.connect(source.pin_p, r.pin_p)
+    d.connect(r.pin_n, c.pin_p)
+    d.connect(c.pin_n, source.pin_n, ground.pin)
+    d.connect(capacity.y, c.C)
+    system = AcausalCompiler(ev, d)()
+    values = {"source.f": 50.0, "source.V": 100.0, "source.phi": 0.3, "r.R_ref": 30.0, "capacity.k": 1e-4}
+    order, names = list(values), ["r.i.re", "r.i.im", "r.P"]
+    found, slopes = run_with_slopes(system, values, [0.01, 0.02], names, names)
+
+    def phasor(values):
+        f, V, phi, R, C = (values[name] for name in order)
+        current = V * jnp.exp(1j * phi) / (R + 1.0 / (2j * jnp.pi * f * C))
+        return jnp.stack([current.real, current.imag, R * jnp.abs(current) ** 2])
+
+    np.testing.assert_allclose(
+        [found[n] for n in names], np.tile(phasor(values)[:, None], 2), rtol=1e-9
+    )  # fmt: skip
+    by_hand = jax.grad(lambda p: jnp.sum(phasor(p)))(values)
+    for name, expected in by_hand.items():
+        assert slopes[name] == pytest.approx(float(expected), rel=1e-7), name
+
+
+def test_sums_and_sines_of_complex_signals(library):
+    """y = k1 u1 + k2 u2, and sin(u), of our signals, beside Python's complex numbers."""
+    ev, d, blocks = EqnEnv(), AcausalDiagram(), "ComplexBlocks.ComplexMath"
+    gains = {"k1.re": 0.5, "k1.im": 0.25, "k2.re": -1.5, "k2.im": 2.0}
+    add, sine = opened(library, f"{blocks}.Add")(ev, "add", **gains), opened(library, f"{blocks}.Sin")(ev, "sine")
+    inputs = {"u1.re": 0.7, "u1.im": -0.2, "u2.re": 1.1, "u2.im": 0.4}
+    signals = [Constant(ev, f"c{k}", value) for k, value in enumerate(inputs.values())]
+    d.add(add, sine, *signals)
+    for signal, name in zip(signals, inputs, strict=True):
+        d.connect(signal, "y", add, name)
+    d.connect(signals[2], "y", sine, "u.re")
+    d.connect(signals[3], "y", sine, "u.im")
+    system = AcausalCompiler(ev, d)()
+    values = {f"add.{name}": value for name, value in gains.items()} | {
+        f"c{k}.k": v for k, v in enumerate([1.1, 0.4], 2)
+    }
+    order, names = list(values), ["add.y.re", "add.y.im", "sine.y.re", "sine.y.im"]
+    found, slopes = run_with_slopes(system, values, [0.1, 0.2], names, names)
+
+    def outputs(values):
+        a, b, c, e, x, y = (values[name] for name in order)
+        total, turned = (a + 1j * b) * (0.7 - 0.2j) + (c + 1j * e) * (x + 1j * y), jnp.sin(x + 1j * y)
+        return jnp.stack([total.real, total.imag, turned.real, turned.imag])
+
+    np.testing.assert_allclose([found[n] for n in names], np.tile(outputs(values)[:, None], 2), rtol=1e-12)
+    for name, expected in jax.grad(lambda p: jnp.sum(outputs(p)))(values).items():
+        assert slopes[name] == pytest.approx(float(expected), rel=1e-10), name
 
 
 ARM = """
