@@ -257,6 +257,8 @@ def _facts(objective: Objective, plan: GradientSteps, optimizer: optax.OptState)
         s.holdout,
         dict(s.inputs),
         repr(s.starts),
+        repr(s.level_of),
+        s.rho,
     ]
     searched = [np.array(objective.free), c.low, c.high, c.start[~objective.free], c.size, c.spread, c.centre, c.shifts]
     functions = eqx.partition((objective.system.neural, objective.observers), eqx.is_array)[1]

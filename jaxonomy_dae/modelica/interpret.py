@@ -152,7 +152,7 @@ class Interpreter(Evaluator):
 
     def _join(self, condition: Value, a: dict[str, Value], b: dict[str, Value], local: dict[str, Value]) -> None:
         """Assigns what two branches assign: that of `a` where the condition holds."""
-        for name in a.keys() | b.keys():
+        for name in a | b:
             otherwise = False if name in ("return", "break") else local.get(name)
             local[name] = self._named(_joined(condition, a.get(name, otherwise), b.get(name, otherwise), self.quiet))
 

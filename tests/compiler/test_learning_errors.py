@@ -10,7 +10,17 @@ from hybrid_models import Doubling
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
 from jaxonomy_dae.errors import ModelError
-from jaxonomy_dae.learning import Data, Experiment, Filter, GradientSteps, Innovations, Problem, Shooting, Unknown
+from jaxonomy_dae.learning import (
+    Data,
+    Experiment,
+    Filter,
+    GradientSteps,
+    Innovations,
+    Noise,
+    Problem,
+    Shooting,
+    Unknown,
+)
 from jaxonomy_dae.learning.training import _facts
 from jaxonomy_dae.write import Component, Eq, der
 
@@ -212,8 +222,8 @@ def test_what_filters_do_not_do(system):
 def test_a_checkpoint_tells_the_integration_the_inputs_and_the_functions(system):
     """Training went on from files that were written with other tolerances, other interpolation, or another law."""
 
-    def facts(kind="linear", law=lambda s: s["tank.level"], **given):
-        data = record({"gauge": TIMES}, inputs={"tank.u": (np.array([0.0, 3.0]), np.ones(2), kind)}, sigma=1.0)
+    def facts(kind="linear", law=lambda s: s["tank.level"], sigma=1.0, **given):
+        data = record({"gauge": TIMES}, inputs={"tank.u": (np.array([0.0, 3.0]), np.ones(2), kind)}, sigma=sigma)
         problem = Problem(system, data, train=["tank.k"], observe={"gauge": law}, **given)
         return _facts(problem._prepared(None, (), None, None), GradientSteps(optax.sgd(0.1), 5), ())
 
@@ -222,6 +232,10 @@ def test_a_checkpoint_tells_the_integration_the_inputs_and_the_functions(system)
 
     base = facts()
     assert facts() == base and facts(law=gain(2.0)) == facts(law=gain(2.0))
+    estimated = facts(sigma="estimate")
+    for noise in (Noise(shared="s"), Noise(rho="estimate"), Noise(rho=0.5)):
+        other = facts(sigma=noise)
+        assert [key for key in base if estimated[key] != other[key]] == ["set of data"]
     for name, other in {
         "kind of inputs": facts("held"),
         "integration": facts(rtol=1e-4),

@@ -141,6 +141,17 @@ def test_functions_are_carried_out():
     assert carried.call("limited", [7.0], {"top": 3.0}) == 3.0
 
 
+def test_branches_are_joined_in_the_order_of_assignment():
+    """The order was that of a set, which differs from process to process, and with it that of equations."""
+    names = [f"v{k}" for k in range(12)]
+    outputs, assigned = (" ".join(text.format(n) for n in names) for text in ("output Real {};", "{} := x;"))
+    function = f"function f input Real x; {outputs} algorithm if x > 1 then {assigned} end if; end f;"
+    x = sympy.Symbol("x", real=True)
+    carried = Interpreter(load(f"package p {function} model m end m; end p;").classes, {"x": x}.__getitem__, {}, {})
+    (algorithm,) = carried.classes["f"].algorithms
+    assert list(carried.assigned_by(algorithm)) == names
+
+
 def test_return_and_break_under_a_condition():
     """What follows a conditional return is carried out where it did not happen."""
     text = """package p

@@ -14,7 +14,8 @@ import pytest
 
 from jaxonomy_dae import InitializationError, ModelError, SimulationError
 from jaxonomy_dae.solve.methods.dae_term import FlatProblem
-from jaxonomy_dae.solve.methods.failures import explain_start, start_check
+from jaxonomy_dae.solve.methods.failures import explain_start, how_it_stopped, start_check
+from jaxonomy_dae.solve.methods.solve import _on_constraints
 from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, consistent_start, solve_dae
 
 ONE, NONE = np.ones(1), np.zeros(1)
@@ -277,6 +278,10 @@ BAD = {
         lambda: solve_dae(TERM, 1.0, GOOD, ts=np.array([0.5, 0.2])),
         "ts must be sorted in the direction of integration",
     ),
+    "times of steps": (
+        lambda: solve_dae(TERM, 1.0, GOOD, stepsize_controller=diffrax.StepTo(ts=np.array([0.0, 0.25, 0.5]))),
+        "the times of StepTo must lead from t0=0 to t1=1, each farther than the one before; they lead from 0 to 0.5",
+    ),
     "times of rank 0": (lambda: solve_dae(TERM, 1.0, GOOD, ts=0.5), "ts must have shape (n,), n ≥ 1; got ()"),
     "adjoint": (
         lambda: solve_dae(TERM, 1.0, GOOD, adjoint=diffrax.BacksolveAdjoint()),
@@ -292,6 +297,29 @@ def test_arguments_that_cannot_work(case):
     with pytest.raises(ModelError) as caught:
         call()
     assert str(caught.value) == message
+
+
+def test_results_are_told_by_their_names():
+    """Whatever ended a run was called steps that are too long."""
+    told = [
+        (diffrax.RESULTS.max_steps_reached, "max_steps=7 was reached"),
+        (diffrax.RESULTS.dt_min_reached, "no step was short enough to be accepted"),
+        (diffrax.RESULTS.nonlinear_divergence, "the solver gave up (Nonlinear solve diverged)"),
+    ]
+    for result, reason in told:
+        assert how_it_stopped(result, 0.5, 7) == f"the integration stopped at t=0.5: {reason}. "
+
+
+def test_rows_that_were_not_reached_are_solved_for_at_the_start():
+    """z = p·log t from t = 1 on: at time 0 the logarithm and with it all derivatives by p were infinite."""
+    term = DAETerm(lambda t, x, z, p: x, lambda t, x, z, p: z - p * jnp.log(t))
+
+    def saved(p):
+        rows = (jnp.array([[3.0], [jnp.nan]]), jnp.array([[0.5], [jnp.nan]]))
+        return _on_constraints(term, p, jnp.array([2.0, jnp.inf]), rows, (jnp.array(1.0), (ONE, NONE)))[1][0, 0]
+
+    value, slope = jax.jit(jax.value_and_grad(saved))(2.0)
+    np.testing.assert_allclose([value, slope], [2 * np.log(2), np.log(2)], rtol=1e-12)
 
 
 @pytest.mark.parametrize("stock", ["Euler", "Heun", "Tsit5", "Dopri8", "ImplicitEuler", "Kvaerno5"])

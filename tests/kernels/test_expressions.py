@@ -1,5 +1,7 @@
 """Expression graphs: cost, branches that are not taken, and functions that stand in equations as they are."""
 
+from fractions import Fraction
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,8 +14,19 @@ from test_functions import compiled
 from jaxonomy_dae import der
 from jaxonomy_dae.graph.expressions.differentiate import directional_derivative, partial_derivative
 from jaxonomy_dae.graph.expressions.from_sympy import read
+from jaxonomy_dae.graph.expressions.functions import TABLE
 from jaxonomy_dae.graph.expressions.kernel import Kernel
-from jaxonomy_dae.graph.expressions.node import ONE, leaf, postorder
+from jaxonomy_dae.graph.expressions.node import (
+    ONE,
+    constant,
+    leaf,
+    linear,
+    make,
+    multiply,
+    number,
+    postorder,
+    power,
+)
 from jaxonomy_dae.write import Eq
 
 X, Y = sympy.symbols("x y", real=True)
@@ -180,6 +193,45 @@ def test_numpy_and_jax_agree():
     expected = np.maximum(x, y) ** 1.5 / (1 + x**2) - np.arctan2(x, y) * (x % 0.3) + np.sqrt(y) - 2
     np.testing.assert_allclose(kernel([x, y], "numpy")[0], expected, rtol=1e-14)
     np.testing.assert_allclose(jax.jit(lambda x, y: kernel([x, y])[0])(x, y), expected, rtol=1e-13)
+
+
+def test_a_function_is_found_by_its_name():
+    """A graph that is loaded evaluates functions that the process has not read before."""
+    kernel = Kernel([make("polygamma6", (leaf("x"),))], ["x"])
+    partial = partial_derivative(make("polygamma6", (leaf("x"),)), "x")
+    found = [*kernel([1.5], "numpy"), *kernel([1.5]), *Kernel([partial], ["x"])([1.5], "numpy")]
+    sixth, seventh = (float(mp.polygamma(n, 1.5)) for n in (6, 7))
+    np.testing.assert_allclose(found, [sixth, sixth, seventh], rtol=1e-12)
+    assert "polygamma" not in TABLE and "gammas" not in TABLE
+
+
+def test_the_derivatives_of_a_bessel_function():
+    """At zero and beside it, where I₁(x)/x is 0/0 and cancels, and on both sides of where its series ends."""
+    nodes = [graph(sympy.besseli(1, X))]
+    for _ in range(3):
+        nodes.append(partial_derivative(nodes[-1], "x"))
+    kernel = Kernel(nodes, ["x"])
+    for x in (0.0, 1e-9, -0.99, 1.01):
+        expected = [float(mp.diff(lambda v: mp.besseli(1, v), x, k)) for k in range(4)]
+        np.testing.assert_allclose(kernel([x], "numpy"), expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(Kernel(nodes[:2], ["x"])([jnp.zeros(())]), [0.0, 0.5], rtol=1e-12)
+
+
+def test_zero_times_infinity_is_no_number():
+    kernel = Kernel([multiply(leaf("x"), leaf("y"))], ["x", "y"])
+    with np.errstate(all="raise"):
+        assert np.isnan(kernel([0.0, np.inf], "numpy")[0]) and np.isnan(kernel([jnp.zeros(()), jnp.array(jnp.inf)])[0])
+        assert np.isnan(kernel([np.zeros(1), np.full(1, np.inf)], "numpy")[0]).all()
+
+
+def test_numbers_beyond_the_largest_are_infinite():
+    """As NumPy and JAX have them; Python raised its own errors."""
+    numbers = [power(constant(1e200), 2), power(constant(-1e200), 3), power(constant(1e-200), -2), constant(-(10**400))]
+    assert [number(n) for n in numbers] == [np.inf, -np.inf, np.inf, -np.inf]
+    assert number(power(constant(10**400), Fraction(1, 2))) == np.inf
+    x = leaf("x")
+    assert Kernel([linear([(10**400, x)], 10**400)], ["x"])([2.0], "numpy") == [np.inf]
+    assert number(power(constant(10**200), 1)) == 10**200  # exact
 
 
 def test_equal_expressions_are_one_node():

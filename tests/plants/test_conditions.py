@@ -16,7 +16,7 @@ import sympy
 from problems import compiled, component
 from sympy import Abs, And, Heaviside, Max, Min, Mod, Or, Piecewise, ceiling, floor, sign
 
-from jaxonomy_dae import Eq, assign, der, pre, reinit, simulate
+from jaxonomy_dae import Eq, assign, der, pre, reinit, simulate, terminate
 
 TIGHT = dict(rtol=1e-10, atol=1e-10)
 pytestmark = pytest.mark.long("runs of models with events are compiled")
@@ -277,3 +277,33 @@ def test_events_at_one_instant_in_any_order(order):
     solution = simulate(system, 1.5, ts=jnp.array([0.75, 1.0, 1.25]), **TIGHT)
     np.testing.assert_allclose(solution[names][1:], [known, [0.775, *known[1:]]], atol=1e-9)
     np.testing.assert_allclose(simulate(system, 1.0, ts=jnp.array([1.0]), **TIGHT)[names], [known], atol=1e-9)
+
+
+# --- what a log says --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_log_of_a_run_that_ends_and_of_one_without_events():
+    """Two events end the run at s = t = 0.8, where w = p·s. Without an event, gradients of what is on both sides of it
+    are zero."""
+
+    def write(self, ev):
+        s, w = self.variable("s", start=0.0, fixed=True), self.variable("w")
+        p, end = self.parameter("p", 0.5), self.parameter("end", 0.8)
+        self.add_equations(Eq(der(s), 1), Eq(w, p * s))
+        self.when(s >= end, terminate("the end"))
+        self.when(2 * s >= 2 * end, assign(self.discrete("beside"), 1))
+
+    system = compiled(component(write))
+
+    def run(p, end):
+        found = simulate(system.with_parameters({"c.p": p, "c.end": end}), 1.0, max_events=3, save_events=True)
+        events = found.events
+        return jnp.sum(jnp.where(jnp.isfinite(events.ts), events.before["c.w"], 0.0)), found
+
+    run = jax.jit(jax.value_and_grad(run, has_aux=True))
+    (value, found), slope = run(0.5, 0.8)
+    np.testing.assert_allclose([value, slope], [0.8, 1.6], rtol=1e-9)
+    assert found.events.terminated == "the end"
+    (value, found), slope = run(0.5, 9.0)
+    assert not len(found.events) and found.events.terminated is None and value == slope == 0

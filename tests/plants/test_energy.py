@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import compiled, damped_oscillation, oscillator
+from problems import compiled, component, damped_oscillation, oscillator
 from sympy import Eq, Symbol
 from trajectories import balanced, solution_of
 
@@ -140,6 +140,18 @@ def test_mechanics_that_is_not_linear():
     np.testing.assert_allclose(
         solution.supply(), -np.asarray(solution["shaker.flange.f"]) * speed, rtol=1e-9, atol=1e-12
     )  # fmt: skip
+
+
+def test_what_no_term_reads_may_have_no_value():
+    """x² + z² where z is identically zero and 1/x, which nobody declares, infinite: the energy was not a number."""
+
+    def write(self, ev):
+        a, x, z = self.variable("a"), self.variable("x", start=0.0, fixed=True), self.variable("z")
+        self.add_equations(Eq(a, 1 / x), Eq(der(x), 1), Eq(z, 0))
+        self.declare_energy(x**2 + z**2)
+
+    solution = solution_of(compiled(component(write)), np.array([0.0, 0.5]), np.array([[0.0], [0.5]]))
+    np.testing.assert_allclose(solution.energy(), [0.0, 0.25], rtol=ROUNDING)
 
 
 def test_a_speed_that_the_model_does_not_have():

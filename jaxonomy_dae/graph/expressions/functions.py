@@ -6,6 +6,7 @@ derivative is zero.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
@@ -23,6 +24,7 @@ from .node import (
     ZERO,
     Node,
     add,
+    as_float,
     compare,
     constant,
     divide,
@@ -59,7 +61,7 @@ def apply(name: str, *arguments: Node) -> Node:
     values = [number(a) for a in arguments]
     if all(v is not None for v in values):
         with np.errstate(all="ignore"):
-            found = float(TABLE[name].numpy(*(np.float64(float(v)) for v in values)))  # pyright: ignore
+            found = float(TABLE[name].numpy(*(np.float64(as_float(v)) for v in values)))  # pyright: ignore
         # A whole value of exact arguments stays exact, as that of cos(0), so that terms beside it may cancel exactly.
         if all(isinstance(v, int | Fraction) for v in values) and found.is_integer() and abs(found) < 1e6:
             found = int(found)
@@ -96,6 +98,20 @@ def _bessel_i(order: int):
         return jsp.i0(x) if order == 0 else jsp.i1(x)
 
     return jax
+
+
+_SERIES = [Fraction(2 * k + 1, 2 ** (2 * k + 1) * math.factorial(k) * math.factorial(k + 1)) for k in range(13)]
+
+
+def _bessel_i1_slope(u: Node) -> Node:
+    """I₁′ = I₀ − I₁/u; within |u| < 1 its series, as that quotient is 0/0 at zero, and cancels beside it.
+
+    The first term left out is below 1e-25, so that the next derivatives keep their digits, too."""
+    square, series = _squared(u), ZERO
+    for c in reversed(_SERIES):
+        series = linear([(1, multiply(square, series))], c)
+    quotient = divide(apply("besseli1", u), u)
+    return select(compare("less", square, ONE), series, linear([(1, apply("besseli0", u)), (-1, quotient)]))
 
 
 def _larger(a: Node, b: Node) -> tuple[Node, Node]:
@@ -217,7 +233,7 @@ _rows = [
         "besseli1",
         ssp.i1,
         _bessel_i(1),
-        lambda u: linear([(1, apply("besseli0", u)), (-1, divide(apply("besseli1", u), u))]),
+        _bessel_i1_slope,
         lambda u: sympy.besseli(1, u),
         1.0,
     ),
@@ -245,17 +261,39 @@ _rows = [
 
 def polygamma(order: int, u: Node) -> Node:
     """The derivative of digamma of this order; a function of its own for each order."""
-    name = f"polygamma{order}"
-    if name not in TABLE:
-        TABLE[name] = Function(
-            name,
-            lambda x: _polygamma(np, ssp, order, x),
-            lambda x: _polygamma(jnp, jsp, order, x),
-            lambda x: (polygamma(order + 1, x),),
-            lambda x: sympy.polygamma(order, x),
-            (1.0,),
-        )
-    return apply(name, u)
+    return apply(f"{_POLYGAMMA}{order}", u)
 
 
-TABLE: dict[str, Function] = {row.name: row for row in _rows}
+_POLYGAMMA = "polygamma"
+
+
+def _polygamma_row(name: str) -> Function:
+    order = int(name.removeprefix(_POLYGAMMA))
+    return Function(
+        name,
+        lambda x: _polygamma(np, ssp, order, x),
+        lambda x: _polygamma(jnp, jsp, order, x),
+        lambda x: (polygamma(order + 1, x),),
+        lambda x: sympy.polygamma(order, x),
+        (1.0,),
+    )
+
+
+class _Table(dict[str, Function]):
+    """Functions by name. Polygamma functions, of which there is no last one, get their rows when they are looked up:
+    also in a process that loads a model, which makes none of its nodes anew."""
+
+    def __missing__(self, name: str) -> Function:
+        if not _is_polygamma(name):
+            raise KeyError(name)
+        return self.setdefault(name, _polygamma_row(name))
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or (isinstance(name, str) and _is_polygamma(name))
+
+
+def _is_polygamma(name: str) -> bool:
+    return name.startswith(_POLYGAMMA) and name.removeprefix(_POLYGAMMA).isdecimal()
+
+
+TABLE: dict[str, Function] = _Table({row.name: row for row in _rows})

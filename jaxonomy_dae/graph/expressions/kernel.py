@@ -11,7 +11,7 @@ import numpy as np
 from ...base.aliases import Numeric
 from .branches import before, guards
 from .functions import TABLE
-from .node import Node, Number, postorder
+from .node import Node, Number, as_float, postorder
 
 _BACKENDS: dict[str, Any] = {"numpy": np, "jax": jnp}
 _Operation = Callable[..., Any]
@@ -111,7 +111,7 @@ def is_active(found: list[Numeric], guard: list) -> Numeric:
 def _constant(node: Node) -> Numeric:
     if node.operation != "constant":
         return np.bool_(node.operation == "true")
-    return float(node.data)
+    return as_float(node.data)
 
 
 def _safe(node: Node) -> tuple[float | None, ...]:
@@ -157,10 +157,10 @@ def _any(*conditions: Numeric) -> Numeric:
 
 
 def _sum(start: Number, coefficients: Sequence[Number]) -> _Operation:
-    start = float(start)
+    start = as_float(start)
     # A positive term first, so that no sign is changed for nothing.
     order = sorted(range(len(coefficients)), key=lambda k: coefficients[k] < 0)
-    scaled = [(k, float(coefficients[k])) for k in order]
+    scaled = [(k, as_float(coefficients[k])) for k in order]
 
     begins = start != 0 and scaled[0][1] == -1  # start − x rather than −x + start
 
@@ -188,7 +188,7 @@ def _sum(start: Number, coefficients: Sequence[Number]) -> _Operation:
 def _is_nought(value: Numeric) -> bool:
     """True if a value is the Python number 0.0 when a program is traced: an unknown whose share in the sum is left
     out."""
-    return isinstance(value, float) and bool(value == 0.0)
+    return type(value) is float and value == 0.0  # that NumPy's numbers are floats, too, is no matter here
 
 
 def _product(exponents: Sequence[Number], xp: ModuleType) -> _Operation:

@@ -85,11 +85,21 @@ def leaf(label: Hashable) -> Node:
     return make("leaf", (), label)
 
 
+def as_float(value: Number) -> float:
+    """The number in floating point: infinite where an exact one is too large."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
 def constant(value: Number) -> Node:
     if value == 0:
         value = 0  # what cancels in floats is the same zero
     if isinstance(value, Fraction) and value.denominator == 1:
         value = value.numerator
+    if math.isinf(as_float(value)):
+        value = as_float(value)  # beside floats, Python raises an error where an exact number is larger than they are
     return make("constant", (), value)
 
 
@@ -224,9 +234,14 @@ def _power_of_numbers(base: Number, exponent: Number) -> Number:
     # Python raises an error here, where NumPy and JAX return an infinity.
     if base == 0 and exponent < 0:
         return math.inf
-    if isinstance(exponent, int):
-        return Fraction(base) ** exponent if isinstance(base, int | Fraction) else base**exponent
-    return math.nan if base < 0 else float(base) ** float(exponent)
+    if isinstance(exponent, int) and isinstance(base, int | Fraction):
+        return Fraction(base) ** exponent
+    if base < 0 and not isinstance(exponent, int):
+        return math.nan
+    try:
+        return as_float(base) ** as_float(exponent)
+    except OverflowError:
+        return -math.inf if base < 0 and exponent % 2 else math.inf
 
 
 def divide(numerator: Node, denominator: Node) -> Node:

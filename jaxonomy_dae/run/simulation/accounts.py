@@ -60,12 +60,13 @@ _compiled = compiled(_terms)
 
 def _at_one_time(system: AcausalSystem, t: Time, x: State, inputs: Args) -> Numeric:
     plan = system.plan
-    every = np.arange(plan.extended.quantities.n)
+    slots = [_slots(plan, group) for group in plan.flat.accounts]
+    # What no term reads may be without a value here, and a last place holds what is identically zero.
+    used = np.unique(np.concatenate([quantity[quantity != ZERO] for quantity, _, _ in slots]))
 
     def quantities(t, x):
-        return system.at(t, inputs).quantities(x, every, np.ones(len(every)))
+        return jnp.append(system.at(t, inputs).quantities(x, used, np.ones(len(used))), 0.0)
 
-    slots = [_slots(plan, group) for group in plan.flat.accounts]
     # Derivatives along the field cost a second evaluation of everything, so they are taken only where a term needs one.
     if any(missing.any() for _, _, missing in slots):
         along = (jnp.ones_like(t), system.at(t, inputs).vector_field(x))
@@ -76,7 +77,8 @@ def _at_one_time(system: AcausalSystem, t: Time, x: State, inputs: Args) -> Nume
     networks = Networks(tuple(system.neural[n] for n in plan.network_names))
     parts = []
     for group, (quantity, factor, missing) in zip(plan.flat.accounts, slots, strict=True):
-        read = jnp.where(missing, slopes[quantity], values[quantity]) * jnp.asarray(factor, values.dtype)
+        place = np.where(quantity == ZERO, len(used), np.searchsorted(used, quantity))
+        read = jnp.where(missing, slopes[place], values[place]) * jnp.asarray(factor, values.dtype)
         value = group.template.residual(list(read.T), *group.numbers(array), t, networks)
         parts.append(jnp.broadcast_to(jnp.asarray(value, values.dtype), (len(group),)))
     return jnp.concatenate(parts)
@@ -84,9 +86,9 @@ def _at_one_time(system: AcausalSystem, t: Time, x: State, inputs: Args) -> Nume
 
 def _slots(plan: SystemPlan, group: AccountGroup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns (quantities, factors, flags), each of shape (n, slots); a flag is set where a derivative beyond those in
-    the table must be taken."""
+    the table must be taken. The quantity of a slot that is identically zero is `ZERO`."""
     table = plan.extended.quantities
-    quantity = np.zeros(group.variable.shape, np.int64)
+    quantity = np.full(group.variable.shape, ZERO, np.int64)
     factor, missing = np.zeros(group.variable.shape), np.zeros(group.variable.shape, bool)
     for place, variable in np.ndenumerate(group.variable):
         q, scale = plan.quantity_of(int(variable))

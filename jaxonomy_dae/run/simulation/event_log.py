@@ -1,6 +1,6 @@
 """The events of a run."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
-from ...base.aliases import Args, Numeric, PyTree, Times
+from ...base.aliases import Args, Numeric, PyTree, State, Time, Times
 from ...base.errors import ModelError
 from ...host.staging import is_traced, on_device
 from ...solve.events.iteration import Iteration
@@ -62,11 +62,12 @@ class Events:
         beyond the last event; differentiable, along with the time of the event.
     - `count`: how many there were, those without room included: an int, inside jit and of a batch an array; outside jit
         also `len(solution.events)`.
-    - `terminated`: with what `terminate(...)` ended the run, or None.
+    - `terminated`: with what `terminate(...)` ended the run, or None; several at one instant are joined by "; ".
     """
 
-    def __init__(self, log: EventLog, system: AcausalSystem, inputs: Args):
-        self._log, self._system, self._inputs = log, system, inputs
+    def __init__(self, log: EventLog, system: AcausalSystem, inputs: Args, first: Callable[[], tuple[Time, State]]):
+        """`first()` is a time of the run and (x, q) there."""
+        self._log, self._system, self._inputs, self._first = log, system, inputs, first
         self._table = system.plan.events
 
     @property
@@ -99,15 +100,16 @@ class Events:
     def terminated(self) -> str | None:
         plan = self._system.plan
         messages = [plan.some_events.table.events[k].message for k in self._numbers()]
-        return messages[-1] if messages else None
+        # Others may be listed at the last instant beside those that end the run.
+        return "; ".join(dict.fromkeys(m for m in messages if m is not None)) or None
 
     @property
     def before(self) -> "Side":
-        return Side(self._log.ts, self._log.before, self._system, self._inputs)
+        return Side(self._log.ts, self._log.before, self._system, self._inputs, self._first)
 
     @property
     def after(self) -> "Side":
-        return Side(self._log.ts, self._log.after, self._system, self._inputs)
+        return Side(self._log.ts, self._log.after, self._system, self._inputs, self._first)
 
     def _numbers(self) -> list[int]:
         if is_traced(self.which) or self.which.ndim != 1:
@@ -128,8 +130,10 @@ class Events:
 class Side:
     """Variables by name, on one side of the events."""
 
-    def __init__(self, ts: Times, rows: PyTree, system: AcausalSystem, inputs: Args):
-        self._given = (system, ts, rows, inputs)
+    def __init__(
+        self, ts: Times, rows: PyTree, system: AcausalSystem, inputs: Args, first: Callable[[], tuple[Time, State]]
+    ):  # fmt: skip
+        self._given, self._first = (system, ts, rows, inputs), first
 
     def __getitem__(self, name: str) -> Array:
         system, ts, rows, inputs = self._given
@@ -147,23 +151,26 @@ class Side:
         quantity, factor = system.plan.resolve([name])
         if not ts.shape[-1]:
             return ts
+        first = self._first()
         if rows.ndim > 2:
-            return eqx.filter_vmap(_observed, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0), None, None))(
-                system, ts, rows, inputs, quantity, factor
+            return eqx.filter_vmap(_observed, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0), 0, None, None))(
+                system, ts, rows, inputs, first, quantity, factor
             )
-        return _observed(system, ts, rows, inputs, quantity, factor)
+        return _observed(system, ts, rows, inputs, first, quantity, factor)
 
 
 def _observed(
-    system: AcausalSystem, ts: Times, rows: PyTree, inputs: Args, quantity: np.ndarray, factor: np.ndarray
-) -> Numeric:
+    system: AcausalSystem, ts: Times, rows: PyTree, inputs: Args, first: tuple[Time, State], quantity: np.ndarray,
+    factor: np.ndarray,
+) -> Numeric:  # fmt: skip
     n, happened = len(system.plan.nominal), jnp.isfinite(ts)
 
     def one(t, row):
         point = system.holding(row[n:]).at(t, inputs)
         return point.quantities(row[:n], np.maximum(quantity, 0), factor)[0]
 
-    # Rows without an event are evaluated at the first one, and left out.
-    safe_t, safe = jnp.where(happened, ts, ts[0]), jnp.where(happened[:, None], rows, rows[0])
+    # Rows without an event are evaluated at the first one, or without any at another point of the run, and left out.
+    t, row = jnp.where(happened[0], ts[0], first[0]), jnp.where(happened[0], rows[0], first[1])
+    safe_t, safe = jnp.where(happened, ts, t), jnp.where(happened[:, None], rows, row)
     values = jnp.where(quantity[0] < 0, 0.0, jax.vmap(one)(safe_t, safe))
     return jnp.where(happened, values, jnp.nan)

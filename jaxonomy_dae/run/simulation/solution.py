@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...base.aliases import Numeric, Result, Solver, Time, Times, Tolerance
+from ...base.aliases import Numeric, Result, Solver, State, Time, Times, Tolerance
 from ...base.errors import ModelError
 from ...base.optional import Axes
 from ...compile.lowering.gather import times
@@ -269,7 +269,12 @@ class Solution(eqx.Module):
         log = self.event_log
         if log is None:
             log = EventLog.empty(self.ts.shape[:-1], self.states.shape[-1], self.states.dtype)
-        return Events(log, self.system, self.inputs)
+        return Events(log, self.system, self.inputs, self._first)
+
+    def _first(self) -> tuple[Time, State]:
+        """The first saved time, and (x, q) there."""
+        parts = [self.states] if self.discrete is None else [self.states, self.discrete]
+        return self.ts[..., 0], jnp.concatenate([rows[..., 0, :] for rows in parts], axis=-1)
 
     @property
     def stats(self) -> dict[str, Numeric]:

@@ -125,8 +125,12 @@ def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
 
 def how_it_stopped(result: Result, t: Time, max_steps: int) -> str:
     """The first sentence of an explanation."""
-    many = result == diffrax.RESULTS.max_steps_reached
-    reason = f"max_steps={max_steps} was reached" if many else "no step was short enough to be accepted"
+    if result == diffrax.RESULTS.max_steps_reached:
+        reason = f"max_steps={max_steps} was reached"
+    elif result == diffrax.RESULTS.dt_min_reached:
+        reason = "no step was short enough to be accepted"
+    else:
+        reason = f"the solver gave up ({diffrax.RESULTS[result].rstrip('.')})"
     return f"the integration stopped at t={float(t):g}: {reason}. "
 
 

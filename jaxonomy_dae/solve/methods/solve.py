@@ -28,7 +28,7 @@ from .failures import SHOWN, StartCheck, Stopped, explain_failure, explain_start
 from .index_one import consistent_point, consistent_shift
 from .rodas5p import Rodas5P
 from .rows import not_a_number
-from .solve_arguments import check_longest_step, check_times, jump_times, tolerance_of
+from .solve_arguments import check_longest_step, check_prescribed_steps, check_times, jump_times, tolerance_of
 from .step_control import StepControl
 
 # Newton steps by which algebraic unknowns are solved for at saved times. Dense output starts them within some
@@ -98,6 +98,7 @@ def solve_dae(
         raise ModelError(f"max_steps must be a positive integer that is known beforehand; got {max_steps!r}")
     check_times(t0, t1, ts)
     check_longest_step(dtmax)
+    check_prescribed_steps(t0, t1, stepsize_controller)
     rtol, atol = default_tolerances(rtol, atol, dtype)
     check_tolerances(rtol, atol, dtype)
     # Numbers become arrays, so that another value is not another program.
@@ -244,7 +245,7 @@ def _solve(of: _Given, checked: bool = False):
     run = integrate(integration, checked=checked)
     reached = jnp.isfinite(run.ts) & check.is_fine
     # The end of the last step is on the constraints already: the methods are stiffly accurate.
-    saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
+    saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, (t0, y0))
     saved = jax.tree.map(lambda y: not_a_number(y, reached, y0, args), saved)
     # Diffrax has no code of its own for an inconsistent start.
     failure: Result = diffrax.RESULTS.nonlinear_divergence
@@ -256,9 +257,10 @@ def _solve(of: _Given, checked: bool = False):
     return check, out, run.last
 
 
-def _on_constraints(term: diffrax.AbstractTerm, args: Args, ts: Times, ys: State, y0: State) -> State:
+def _on_constraints(term: diffrax.AbstractTerm, args: Args, ts: Times, ys: State, start: tuple[Time, State]) -> State:
     """Saved values with their algebraic unknowns solved for: dense output interpolates those, and no error estimate
     covers how fast they vary within a step."""
+    t0, y0 = start
 
     def one(t, y):
         problem = FlatProblem(term, y, args)
@@ -268,7 +270,7 @@ def _on_constraints(term: diffrax.AbstractTerm, args: Args, ts: Times, ys: State
         # Rows that were not reached are solved for at the start, so that their derivatives are finite, and left out
         # after.
         safe = jnp.where(filled, problem.flat, ravel_pytree(y0)[0])
-        moved, _ = consistent_point(problem, None, jnp.where(filled, t, 0), safe, SAVED_ITERATIONS)
+        moved, _ = consistent_point(problem, None, jnp.where(filled, t, t0), safe, SAVED_ITERATIONS)
         kept = filled & jnp.all(jnp.isfinite(moved))
         return problem.unravel(jnp.where(kept, moved, problem.flat))
 

@@ -2,12 +2,13 @@
 
 import math
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from ...base.aliases import Numeric, State, Time, Times, Tolerance
+from ...base.aliases import Controller, Numeric, State, Time, Times, Tolerance
 from ...base.errors import ModelError
 from ...host.staging import as_array, is_traced
 
@@ -48,6 +49,19 @@ def check_times(t0: Time, t1: Time, ts: Times):
         )
     if (np.diff(saved) * (1 if a <= b else -1) < 0).any():
         raise ModelError("ts must be sorted in the direction of integration")
+
+
+def check_prescribed_steps(t0: Time, t1: Time, controller: Controller) -> None:
+    """Refuses a `diffrax.StepTo` whose times do not lead from t0 to t1."""
+    if not isinstance(controller, diffrax.StepTo) or is_traced((t0, t1, controller.ts)):
+        return
+    steps = np.asarray(controller.ts)
+    a, b = (np.asarray(t, steps.dtype) for t in (t0, t1))
+    if steps[0] != a or steps[-1] != b or not (np.diff(steps) * (1 if a <= b else -1) > 0).all():
+        raise ModelError(
+            f"the times of StepTo must lead from t0={float(a):g} to t1={float(b):g}, each farther than the one before; "
+            f"they lead from {float(steps[0]):g} to {float(steps[-1]):g}"
+        )
 
 
 def tolerance_of(atol: Tolerance, y: State) -> Tolerance:
