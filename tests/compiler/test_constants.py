@@ -77,7 +77,6 @@ METHODS = {
     "run/simulation/arguments": "sample times that lie outside the interval by their rounding",
     "run/simulation/solution": "tolerances of a run, by default",
     "run/simulation/step_sizes": "first steps",
-    "solve/methods/steep_rest": "a distance from zero at which roots have finite slopes",
     "solve/methods/solve": "tolerances of a run, by default",
 }
 APART = ("learning", "library", "write", "plotting", "testing", "graph/units")  # they judge no solution of equations

@@ -7,9 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.integrate
-import scipy.optimize
-import sympy
 from problems import compiled
 from sympy import Eq
 
@@ -137,34 +134,3 @@ def implicit():
 def test_other_methods_and_motion_that_tolerances_do_not_see(x0, options):
     """The run would take a few long steps."""
     assert abs(slope(x0, of=implicit, **options) - np.cos(OMEGA)) < RESOLVED
-
-
-class Leaky(Component):
-    """x' = u − p·√|x|·sign(x): at zero, x returns with an infinite slope."""
-
-    def __init__(self, ev, name):
-        super().__init__(ev, name)
-        p, x = self.parameter("p", 2.0), self.variable("x", start=self.parameter("x0", 0.0), fixed=True)
-        self.add_equations(Eq(der(x), self.input("u") - p * sympy.sqrt(sympy.Abs(x)) * sympy.sign(x)))
-
-
-def pushed_away(p):
-    """At rest until t = 1, where u begins to rise: x = a·(t − 1)² with 2a = 1 − p·√a up to t = 2, where u stays."""
-    a = scipy.optimize.brentq(lambda a: 2 * a + p * np.sqrt(a) - 1, 0, 1, xtol=1e-16)
-    run = scipy.integrate.solve_ivp(lambda t, x: 1 - p * np.sqrt(x), (2, 3), [a], rtol=1e-12, atol=1e-14)
-    return run.y[0, -1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("by", [jax.grad, jax.jacfwd])
-def test_a_root_at_rest_that_is_pushed_away(by):
-    """∂x'/∂x is minus infinity at rest: the derivative was not a number."""
-    leaky = compiled(Leaky(EqnEnv(), "c"))
-    inputs = {"c.u": (np.array([0.0, 1.0, 2.0, 3.0]), np.array([0.0, 0.0, 1.0, 1.0]))}
-
-    def end(given):
-        of = leaky.with_parameters({"c.p": given[0], "c.x0": given[1]})
-        return simulate(of, 3.0, ts=jnp.array([3.0]), inputs=inputs, rtol=1e-8, atol=1e-9)["c.x"][-1]
-
-    known = (pushed_away(2.001) - pushed_away(1.999)) / 2e-3  # −0.201358
-    np.testing.assert_allclose(by(end)(jnp.array([2.0, 0.0])), [known, 0.0], rtol=2e-6, atol=1e-9)

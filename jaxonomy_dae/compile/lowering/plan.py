@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool
 
 from ...base.errors import ModelError, nearest
-from ...graph.expressions.roots import takes_roots
 from ...graph.structure.integers import distinct
 from ...solve.linear.sparse import SparsePattern
 from ..model.array_names import inner_name, one_by_one
@@ -20,7 +19,6 @@ from ..model.identity import Identity
 from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
 from ..model.quantities import QuantityMap, QuantityNames, ReducedModel
-from ..model.symbolic import SymbolicTemplate, slot_label
 from ..model.tables import ZERO, FlatModel, provenance_of
 from ..passes.order_blocks import Blocks
 from ..passes.select_states import StateSelection
@@ -222,16 +220,6 @@ class SystemPlan:
         n, found = len(self.states), self.dae_pattern
         inside = (found.rows >= n) & (found.cols >= n)
         return SparsePattern(found.rows[inside] - n, found.cols[inside] - n, len(self.carried))
-
-    @functools.cached_property
-    def takes_roots(self) -> bool:
-        """True if an equation takes a root of a quantity itself, whose slope is infinite at zero, and all functions of
-        the model can be differentiated in both modes."""
-        templates = {id(group.template): group.template for group in self.extended.groups}.values()
-        if self.network_names or any(template.opaque is not None for template in templates):
-            return False
-        symbolic = [template for template in templates if isinstance(template, SymbolicTemplate)]
-        return any(takes_roots([t.graph], set(map(slot_label, t.slots)).__contains__) for t in symbolic)
 
     @functools.cached_property
     def written_blocks(self) -> tuple[DummyBlocks, ...]:

@@ -12,7 +12,6 @@ from ...solve.linear.choice import SPARSE_FROM
 from ...solve.methods import BDF, DAETerm, Tsit5
 from ...solve.methods.choice_guard import ChoiceGuard
 from ...solve.methods.projected import with_projection
-from ...solve.methods.steep_rest import AtSteepRest
 from ...solve.methods.switching import Watch
 from ..system.system import AcausalSystem
 
@@ -44,9 +43,6 @@ def prepared(
         solver = Tsit5(solver.scan_kind)
     if isinstance(solver, Tsit5) and watch is not None:
         solver = dataclasses.replace(solver, watch=watch)
-    plan = system.plan
-    if plan.takes_roots and not len(plan.carried) and not isinstance(solver, BDF | diffrax.AbstractWrappedSolver):
-        solver = AtSteepRest(solver)
     # A minimal set of states may become a singular choice on the way.
     guard = ChoiceGuard(system.dummy_determinants, atol) if system.plan.dummy_blocks else None
     project = system.project if judged else _converged(system)

@@ -23,7 +23,6 @@ from ...host.cache import compiled
 from ...host.platform import precisely
 from ...host.staging import is_staged, is_traced, joined, on_device, picked
 from ...solve.linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
-from ...solve.methods.steep_rest import without_idle_roots
 from .bounds import constrained, unconstrained
 from .input_values import check_given
 from .inputs import check_range, read_inputs
@@ -336,9 +335,6 @@ class AcausalSystem(eqx.Module):
 
     def vector_field(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""
-        if self.plan.takes_roots and not len(self.plan.carried):
-            # A point keeps what it has computed, which must not leave the branch in which it was.
-            return without_idle_roots(lambda y: self.at(t, args).vector_field(y), x)
         return self.at(t, args).vector_field(x)
 
     def semi_explicit(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
