@@ -129,7 +129,7 @@ def _heaviside(xp):
 
 
 def _hypot(xp):
-    """√(a² + b²); its derivative at the origin is zero."""
+    """√(a² + b²). JAX gives it the derivative zero at the origin; the partial derivatives below have no value there."""
 
     def function(a, b):
         square = a * a + b * b
