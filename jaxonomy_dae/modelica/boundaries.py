@@ -109,6 +109,7 @@ def _alone(
 ) -> tuple[Flattened, list[str]]:
     """The class by itself, and the overdetermined records that need a root outside."""
     extended = f"extends {name}({changes});" if changes else f"extends {name};"
+    # rumoca names one record without a root at a time, so that each one costs another flattening.
     trees: list[str] = []
     while True:
         try:
@@ -209,6 +210,7 @@ def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) ->
     outer = frozenset(n for n in names if not n.startswith((_INSIDE, _RIM)))
 
     def under_own_names(of: Json, also: Mapping[str, str]) -> Json:
+        # As text, since names stand in many lists of these records.
         text = json.dumps(of).replace(f'"{_INSIDE}.', '"')
         for before, after in also.items():
             text = text.replace(f'"{before}"', f'"{after}"')

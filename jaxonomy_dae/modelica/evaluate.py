@@ -141,6 +141,7 @@ class Evaluator:
         sign = e.operator
         if sign in ("and", "or"):
             a = self.evaluate(e.left, names)
+            # The right side may have no value, as the entry of an array of size zero behind "n > 0 and".
             if isinstance(a, bool) and a == (sign == "or"):
                 return a
             return entrywise(both if sign == "and" else either, a, self.evaluate(e.right, names))
@@ -176,6 +177,7 @@ class Evaluator:
             if holds is True:
                 pairs.append((True, self.evaluate(value, names)))
                 break
+            # What is named inside holds under this condition only.
             self.guards.append(holds)
             pairs.append((holds, self.evaluate(value, names)))
             self.guards[-1] = negated(holds)
@@ -248,6 +250,7 @@ class Evaluator:
     def _without_events(self, e: tree.Call, names: Names) -> Value:
         if e.function == "smooth" and self.constant(e.arguments[0], names) == 0:
             return self.evaluate(e.arguments[1], names)  # continuous only: its kinks stay events
+        # Put back rather than set to False: `noEvent` may stand in another one.
         before, self.quiet = self.quiet, True
         try:
             value = self.evaluate(e.arguments[-1], names)

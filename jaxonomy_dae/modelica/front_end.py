@@ -107,6 +107,7 @@ class FrontEnd:
 
     def _said(self, text: str, model: str | None, error: str) -> str:
         """What rumoca found wrong, with its place."""
+        # A syntax error has a place in the text, which the error of the flattening does not say.
         wrong = [d.message for d in self.rumoca.validate_source(text, model=model) if d.rule == "syntax-error"]
         if place := _PLACE.search("\n".join(wrong)):
             return f"Modelica, line {place['line']}, column {place['column']}: {place['what'].strip()}"

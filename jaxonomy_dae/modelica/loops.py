@@ -107,6 +107,7 @@ def repeated(condition: Value, state: Sequence[Carried], after: Sequence[Value])
             goes_on, *new = kernel([*fixed, *values])
             return jnp.asarray(goes_on) > 0.5, jnp.stack([jnp.asarray(v, start.dtype) for v in new])
 
+        # Bounded: reverse mode must go back over the rounds, which it cannot where their number has no limit.
         end = private("while_loop")(
             lambda values: one(values)[0], lambda values: one(values)[1], start, max_steps=MOST, kind="bounded"
         )

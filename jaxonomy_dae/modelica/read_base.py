@@ -11,6 +11,7 @@ from typing import NoReturn
 from ..base.errors import ModelError
 from . import tree
 
+# White space and comments belong to the token behind them: one match for each token, as a text may have a megabyte.
 _TOKEN = re.compile(
     r"""(?:\s+|//[^\n]*|/\*.*?\*/)*
     (?: (?P<string>"(?:[^"\\]|\\.)*") | (?P<quoted>'(?:[^'\\]|\\.)*') | (?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)
@@ -76,6 +77,7 @@ def _call(
 ) -> tree.Call:
     """A call; named arguments of operators in their places."""
     given = dict(named)
+    # Only if no place between them stays empty.
     order = _ARGUMENTS.get(function, ())[len(arguments) :]
     if not given or not given.keys() <= set(order) or list(order[: len(given)]) != [n for n in order if n in given]:
         return tree.Call(function, arguments, named)
@@ -436,6 +438,7 @@ class Reader:
             name = self.name()
             dimensions = self._subscripts() + shared
             modifiers, value = self.modifiers(), self._value()
+            # Front ends obey the condition of a component when they flatten: it is passed over here.
             if self.take("if"):
                 self.expression()
             self.pass_constraint()

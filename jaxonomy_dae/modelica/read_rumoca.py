@@ -72,6 +72,7 @@ class _Reader:
         if not self.flows:
             return ops
         closed = [self._set_to_zero(op) for op in ops]
+        # Flows of an array of connectors are closed by one equation for all, under the name of the array.
         owner = {flow: flow if flow in closed else re.sub(r"\[[\d,]*\]$", "", flow) for flow in sorted(self.flows)}
         for flow, name in owner.items():
             if closed.count(name) != 1:

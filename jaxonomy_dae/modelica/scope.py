@@ -327,6 +327,7 @@ class Scope:
             )
         nominal = self._start(d.modifiers.get("nominal"))
         start = self._start(d.modifiers.get("start"))
+        # An input of a part is bound to what drives it, and is an ordinary variable.
         if "input" in d.prefixes and d.value is None:
             return self.component.input(d.name, default=None if start is None else float(start), unit=self._unit(d))
         fixed = d.modifiers.get("fixed") == Truth(True)
@@ -336,6 +337,7 @@ class Scope:
             self.definitions.equations.append(Equality(Reference((d.name,)), d.value, d.line))
         return self.component.variable(
             d.name, start=start, fixed=fixed, unit=self._unit(d),
+            # A nominal value of zero, or in parameters, says nothing of a size that is known now.
             nominal=abs(nominal) if isinstance(nominal, int | float) and nominal else None,
         )  # fmt: skip
 

@@ -94,6 +94,8 @@ class Sources:
         key = name, *(s.key for s in scopes)
         if key in self.looked_up:
             return self.looked_up[key]
+        # Within another search, classes that are being searched are passed over: its answer may lack something, and is
+        # not kept.
         complete = not self.busy
         found = self._lookup(name, scopes)
         if complete:

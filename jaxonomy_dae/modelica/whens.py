@@ -81,6 +81,7 @@ class _Algorithm:
 
     def carry_out_when(self, s: tree.Branches) -> None:
         acting = self.scope.discrete.branches([list(_conditions(self.scope, c, self.names)) for c, _ in s.branches])
+        # Each branch begins with the values before the `when`: only one of them acts.
         before, results = dict(self.local), []
         for acts, (_, body) in zip(acting, s.branches, strict=True):
             self.local = dict(before)
