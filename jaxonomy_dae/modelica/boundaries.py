@@ -88,6 +88,7 @@ def flattened(
     variables = alone.flat["variables"]
     declared, equations, renamed = [f"{name} {modified};"], [], {}
     if "world.enableAnimation" in variables:
+        # Without animation, whose shapes are variables that nothing reads.
         declared.append("inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false);")
     for k, top in enumerate(streams):
         declared += _rim(k, top, variables)
@@ -252,6 +253,7 @@ def without_boundaries(model: FlatModel, outer: frozenset[str]) -> FlatModel:
     around -= {re.sub(r"\[[\d,]+\]$", "", n) for n in parameters}
     mine = [(e, names) for e, names in kept if not names or names - around - parameters]
     others = [(e, names) for e, names in kept if names and not names - around - parameters]
+    # What the class reads of an outer component belongs to it, with all that determines this.
     read = {n for _, names in mine for n in names & around}
     while more := [(e, names) for e, names in others if names & read and (e, names) not in mine]:
         mine += more

@@ -47,6 +47,7 @@ def _extreme(smaller: bool) -> Callable[..., Value]:
             return functools.reduce(both if smaller else either, entries)
         if all(isinstance(e, int | float) for e in entries):
             return number(entries)
+        # Unevaluated: SymPy would compare all pairs of entries.
         return smooth(symbol(*entries, evaluate=False))
 
     return extreme

@@ -387,6 +387,7 @@ class _Complex:
         self.values[name] = self.pair(value) if self.is_complex(value) else self.real(value)
 
     def _of_entries(self, e: tree.Call, which: list[bool]) -> tree.Expression | Pair:
+        # A call within the arguments of another one counts by a name of its own.
         depth = sum(n.startswith(_ENTRY) for n in self.local)
         name = f"{_ENTRY}{depth}"
         place = tree.Reference((name,))

@@ -125,6 +125,7 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
              if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(_name(e.left))}
             for body in bodies
         ]  # fmt: skip
+        # Without an else, nothing says what a variable is where no condition holds.
         names = [n for n in values[0] if all(n in v for v in values)] if conditions[-1] == tree.Truth(True) else []
         for n in names:
             branches = tuple((c, v[n]) for c, v in zip(conditions[:-1], values, strict=False))

@@ -127,6 +127,7 @@ class Evaluator:
 
     def _by_choice(self, value: list, index: Value, rest: tuple, names: Names) -> Value:
         """The entry of an array whose subscript is not constant."""
+        # The last entry needs no condition: a subscript outside of the array means nothing.
         entries = [self._entry(row, rest, names) for row in value]
         out = entries[-1]
         for k in range(len(entries) - 1, 0, -1):
@@ -240,6 +241,7 @@ class Evaluator:
         named = {k: self.evaluate(v, names) for k, v in e.named}
         if name in FUNCTIONS:
             return applied(name, arguments, named)
+        # A function that is an argument is called by the argument's name.
         if name not in self.classes and "." not in name:
             try:
                 return names(name)(*arguments, **named)

@@ -239,6 +239,7 @@ class _Reader:
                     target, value = self.of.variable(d["target"]["variable"]), self.of.expression(d["value"], {})
                     yield target.path, step["trigger"], step["guard"], tree.Assignment(target, value, line)
         for activation, target, where, e in self._of_discrete():
+            # Variables of an algorithm stand here, too, without the order of its steps.
             if activation != "always" and target not in in_steps:
                 yield target, *self._when(activation, where), e
         for action in s["event_actions"]:

@@ -393,6 +393,7 @@ class Scope:
         outside = table.outside(u) if isinstance(u, sympy.Expr) else False
         outside = functools.reduce(both, self.interpreter.guards, outside)
         if not isinstance(outside, bool) and outside not in self.ends and outside.atoms(VariableSymbol, TimeSymbol):
+            # One event for each condition, however many columns of a table are read.
             self.ends.add(outside)
             first, last = table.rows[0, 0] + table.shift, table.rows[-1, 0] + table.shift
             told = f"a table is read outside of [{first:g}, {last:g}], without extrapolation"

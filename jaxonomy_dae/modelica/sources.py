@@ -258,6 +258,7 @@ class Sources:
     def _file_of(self, name: str) -> Found | None:
         for root in self.roots:
             places = [root / name / "package.mo", root / f"{name}.mo"]
+            # Folders of libraries may carry a version, as "Modelica 4.1.0" does.
             places += [root / "package.mo"] if root.name.split(" ")[0] == name else []
             places += [root] if root.stem == name and root.suffix == ".mo" else []
             for file in places:
