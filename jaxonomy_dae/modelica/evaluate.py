@@ -13,7 +13,7 @@ from . import tree
 from .builtin import FUNCTIONS, applied, matrix_product, numbers_checked
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
-from .read_base import FUNCTION
+from .read_expressions import FUNCTION
 from .values import Record, Results, Value, both, chosen, either, entrywise, is_condition, negated
 
 Names = Callable[[str], Value]  # the value of a name; raises KeyError for an unknown one

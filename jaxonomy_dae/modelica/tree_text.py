@@ -4,7 +4,7 @@ import re
 
 from ..base.errors import ModelError
 from . import tree
-from .read_base import FUNCTION
+from .read_expressions import FUNCTION
 
 _PLAIN = re.compile(r"[A-Za-z_]\w*\Z")
 
