@@ -79,6 +79,7 @@ class Scope:
         self.kept = self.discrete.kept
         self.as_numbers = False
         self.final: dict[str, Value] = {}
+        # Only now: sizes may depend on parameters, records and functions, which the interpreter finds by their names.
         self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
         self.declared = {d.name: d for d in flat.model.declarations}
         entries, fields = _gather(self.declared)
@@ -292,6 +293,7 @@ class Scope:
                 if isinstance(s.left, Reference) and s.left.path == name and not any(s.left.subscripts):
                     try:
                         return self.interpreter.evaluate(s.right, self._at_start)
+                    # Such as one that depends on itself through another parameter: then both are found by solving.
                     except ModelError:
                         return None
         return None

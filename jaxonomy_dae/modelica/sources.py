@@ -105,6 +105,7 @@ class Sources:
     def _lookup(self, name: str, scopes: Sequence[Found]) -> tuple[Member, list[str]] | None:
         first, *rest = name.split(".")
         for scope in scopes:
+            # What is declared or inherited hides what is imported (section 5.3.1).
             found = self.member(scope, first) or self._imported(scope, first)
             if found is not None:
                 break
