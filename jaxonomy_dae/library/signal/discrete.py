@@ -151,4 +151,5 @@ class Counter(Component):
         u, y = self.input("u"), self.variable("y", unit="1")
         count = self.discrete("count", unit="1")
         self.add_equations(Eq(y, count))
+        # Not at the start: an input that begins above the threshold has not risen.
         self.when(u > level, assign(count, pre(count) + 1))
