@@ -13,7 +13,7 @@ from . import tree
 from .builtin import FUNCTIONS, applied, matrix_power, matrix_product, numbers_checked, rows_joined
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
-from .read_base import FUNCTION
+from .read_expressions import FUNCTION
 from .values import Record, Results, Value, both, chosen, either, entrywise, is_condition, negated
 
 Names = Callable[[str], Value]  # the value of a name; raises KeyError for an unknown one
@@ -127,6 +127,7 @@ class Evaluator:
 
     def _by_choice(self, value: list, index: Value, rest: tuple, names: Names) -> Value:
         """The entry of an array whose subscript is not constant."""
+        # The last entry needs no condition: a subscript outside of the array means nothing.
         entries = [self._entry(row, rest, names) for row in value]
         out = entries[-1]
         for k in range(len(entries) - 1, 0, -1):
@@ -141,6 +142,7 @@ class Evaluator:
         sign = e.operator
         if sign in ("and", "or"):
             a = self.evaluate(e.left, names)
+            # The right side may have no value, as the entry of an array of size zero behind "n > 0 and".
             if isinstance(a, bool) and a == (sign == "or"):
                 return a
             return entrywise(both if sign == "and" else either, a, self.evaluate(e.right, names))
@@ -178,6 +180,7 @@ class Evaluator:
             if holds is True:
                 pairs.append((True, self.evaluate(value, names)))
                 break
+            # What is named inside holds under this condition only.
             self.guards.append(holds)
             pairs.append((holds, self.evaluate(value, names)))
             self.guards[-1] = negated(holds)
@@ -240,6 +243,7 @@ class Evaluator:
         named = {k: self.evaluate(v, names) for k, v in e.named}
         if name in FUNCTIONS:
             return applied(name, arguments, named)
+        # A function that is an argument is called by the argument's name.
         if name not in self.classes and "." not in name:
             try:
                 return names(name)(*arguments, **named)
@@ -250,6 +254,7 @@ class Evaluator:
     def _without_events(self, e: tree.Call, names: Names) -> Value:
         if e.function == "smooth" and self.constant(e.arguments[0], names) == 0:
             return self.evaluate(e.arguments[1], names)  # continuous only: its kinks stay events
+        # Put back rather than set to False: `noEvent` may stand in another one.
         before, self.quiet = self.quiet, True
         try:
             value = self.evaluate(e.arguments[-1], names)

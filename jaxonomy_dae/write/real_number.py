@@ -22,6 +22,7 @@ def real_number(value: object, where: str, hint: str = "") -> float:
     """
     given: Any = value
     text = ""
+    # `float` would read texts of numbers, and NumPy would cut off imaginary parts with a warning.
     if isinstance(value, str):
         text = f"; got the string {value!r}" + (f": write {value} without quotes" if _is_numeral(value) else "")
     elif _is_complex(value):

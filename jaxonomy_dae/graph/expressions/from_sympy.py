@@ -244,6 +244,7 @@ _WRITTEN: dict[object, Callable[..., Node]] = {
     sympy.Ge: lambda a, b: compare("less_equal", b, a),
     sympy.Eq: lambda a, b: compare("equal", a, b),
     sympy.Ne: lambda a, b: negate(compare("equal", a, b)),
+    # All that can be read is real.
     sympy.re: lambda u: u,
     sympy.conjugate: lambda u: u,
     sympy.KroneckerDelta: lambda a, b: select(compare("equal", a, b), ONE, constant(0)),
