@@ -102,7 +102,7 @@ def flattened(
         equations.append(f"{_INSIDE}.{n} = {_RIM}u{k};")
     roots = _roots(trees, f"{_INSIDE}.")
     text = f"{before}{_model([*declared, *roots[0]], [*roots[1], *equations])}"
-    return _as_alone(front_end.flatten(text, MODEL), alone, renamed)
+    return _as_alone(front_end.flatten(text, MODEL, called=name), alone, renamed)
 
 
 def _alone(
@@ -116,7 +116,8 @@ def _alone(
         try:
             if changes or trees:
                 declared, equations = _roots(trees, "")
-                found = front_end.flatten(f"{source or ''}\n{_model([extended, *declared], equations)}", MODEL)
+                text = f"{source or ''}\n{_model([extended, *declared], equations)}"
+                found = front_end.flatten(text, MODEL, called=name)
             else:
                 found = front_end.flatten(source, name)
         except Unrooted as error:

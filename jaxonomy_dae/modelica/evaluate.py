@@ -27,7 +27,8 @@ class Evaluator:
     - `special`: calls that only the model can answer, such as `pre`, by name: from the arguments as written.
     - `externals`: functions in place of those that are written in C, by name.
     - `named`: gives an expression of a function a name, so that what is read several times stands once.
-    - `opaque`: the results of a function of JAX, so many, from the values of its arguments.
+    - `opaque`: the results of a function of JAX, so many, from the values of its arguments, and
+        what messages call it.
     - `entries`: the places of the entries that are declared one by one, by the name of their array.
     """
 
@@ -39,7 +40,7 @@ class Evaluator:
         externals: Mapping[str, Callable[..., Value]],
         entries: Mapping[str, list[tuple[int, ...]]] | None = None,
         named: Callable[[sympy.Expr], Value] = lambda e: e,
-        opaque: Callable[[Callable, Sequence[Value], int], Sequence[Value]] = lambda *_: (),
+        opaque: Callable[[Callable, Sequence[Value], int, str], Sequence[Value]] = lambda *_: (),
     ):
         self.classes, self.names, self.entries = classes, names, entries or {}
         self.special, self.externals = special, externals

@@ -366,7 +366,7 @@ class Scope:
             self.component.add_equations(sympy.Eq(self.names[e], self.kept.in_equations(e), evaluate=False))
         return self.names[e]
 
-    def _opaque(self, function: Callable, arguments: Sequence[Value], count: int) -> Sequence[Value]:
+    def _opaque(self, function: Callable, arguments: Sequence[Value], count: int, called: str) -> Sequence[Value]:
         """The results of a function of JAX, as variables; its arguments are variables, too."""
         c = self.component
         inputs: list[sympy.Symbol] = []
@@ -376,7 +376,7 @@ class Scope:
                 c.add_equations(sympy.Eq(symbol, value, evaluate=False))
                 value = symbol
             inputs.append(value)
-        return c.function(f":loop[{len(c.learned_terms)}]", function, inputs, count)
+        return c.function(f":{called}[{len(c.learned_terms)}]", function, inputs, count)
 
     def _root(self, *arguments: Value) -> Value:
         return root(self.component, self.interpreter.guards, *arguments)

@@ -62,6 +62,17 @@ def read_source(file: Path) -> Class:
     return found._replace(folder=file.parent) if file.name == "package.mo" else found
 
 
+def first_broken(roots: Sequence[Path]) -> str | None:
+    """What is wrong with the first file of some roots that is not Modelica."""
+    for root in roots:
+        for file in sorted(root.rglob("*.mo")) if root.is_dir() else [root]:
+            try:
+                read_source(file)
+            except ModelError as error:
+                return str(error)
+    return None
+
+
 class Sources:
     """Libraries in folders; `Modelica` of `roots=["lib"]` is `lib/Modelica/package.mo` or `lib/Modelica.mo`, and a root
     may be the folder `lib/Modelica` itself, or a file."""
