@@ -268,7 +268,10 @@ def bode(response: Response, *pairs: tuple[str, str], axes: Any = None) -> Any:
         values = np.asarray(response[pair])[order]
         with np.errstate(divide="ignore"):  # −∞ dB, a gap in the line
             upper.semilogx(omega, 20.0 * np.log10(np.abs(values)), label=_arrow(pair), linewidth=1.6)
-        lower.semilogx(omega, np.degrees(np.unwrap(np.angle(values))), label=_arrow(pair), linewidth=1.6)
+        phase = np.angle(values)
+        known = np.isfinite(phase)  # not at a pole on the axis, over which phases are unwrapped all the same
+        phase[known] = np.unwrap(phase[known])
+        lower.semilogx(omega, np.degrees(phase), label=_arrow(pair), linewidth=1.6)
     upper.set_ylabel("Magnitude / dB")
     lower.set_ylabel("Phase / °")
     lower.set_xlabel("Angular frequency / (rad/s)")

@@ -31,6 +31,8 @@ def real_number(value: object, where: str, hint: str = "") -> float:
         raise ModelError(f"{where} must be a real number{text}")
     try:
         number = float(given)
+    except OverflowError:  # an integer beyond them
+        raise ModelError(f"{where} must be finite; got a number beyond 1e308") from None
     except (TypeError, ValueError):
         raise ModelError(f"{where} must be a number; got {type(value).__name__}{hint * _is_array(value)}") from None
     if not math.isfinite(number):
