@@ -122,6 +122,7 @@ def _machine() -> str:
     """What the machine code of this process may rely on."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
+        # Each core has these lines. How many cores there are must not count.
         told = [line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))]
         processor = "\n".join(sorted(set(told)))
     except OSError:
@@ -211,6 +212,7 @@ def _write(path: Path, content: bytes) -> None:
         # A rename is atomic within one folder: a reader sees the whole file or none.
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix="new-", suffix=".program", delete=False) as file:
             draft = file.name
+            # The digest shows a file that was cut off, or has changed on its disk.
             file.write(hashlib.sha256(content).digest() + content)
         os.replace(draft, path)
         draft = None
@@ -260,6 +262,7 @@ def _make_room(where: Path) -> None:
     taken = sum(size for _, size, _ in files)
     if taken <= ROOM:
         return
+    # By date: the least recently used first.
     for _, size, path in sorted(files):
         with contextlib.suppress(OSError):
             os.unlink(path)

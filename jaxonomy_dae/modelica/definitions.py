@@ -47,6 +47,7 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
     others = _with_choices(_by_entries(rest, model, is_discrete), is_discrete)
     sections = [section for section in model.algorithms if any(_whens_in(section))]
     by_when = set(with_entries(assigned_in((*whens, *(w for section in sections for w in _whens_in(section)))), model))
+    # In an algorithm with a when, what stands outside of it is kept, too: statements before and after read each other.
     by_when |= {n for section in sections for n in with_entries(assigned_in(section), model) if is_discrete(n)}
     algorithms = []
     for section in model.algorithms:
@@ -124,6 +125,7 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
              if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(_name(e.left))}
             for body in bodies
         ]  # fmt: skip
+        # Without an else, nothing says what a variable is where no condition holds.
         names = [n for n in values[0] if all(n in v for v in values)] if conditions[-1] == tree.Truth(True) else []
         for n in names:
             branches = tuple((c, v[n]) for c, v in zip(conditions[:-1], values, strict=False))

@@ -17,6 +17,7 @@ def contents(root: Path, folder: Path) -> str:
         return known.read_text()
     digest = hashlib.sha256()
     for f in files:
+        # Names from the root on: a library that was moved or copied is the same.
         digest.update(f"{f.relative_to(root.parent)} {f.stat().st_size}\n".encode() + f.read_bytes())
     write(known, digest.hexdigest().encode())
     return digest.hexdigest()
