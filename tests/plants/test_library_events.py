@@ -577,7 +577,8 @@ def sampling():
     blocks = [
         sig.SampleHold(ev, "hold", T, initial_y=7.0), sig.SampledDelay(ev, "late", 3, T, initial_y=0.4),
         sig.DiscreteTransferFunction(ev, "tf", NUMERATOR, DENOMINATOR, T),
-        sig.DiscretePI(ev, "pi", 2.0, 3.0, T), sig.DiscretePI(ev, "bounded", 2.0, 3.0, T, low=-0.8, high=1.0),
+        sig.DiscretePI(ev, "pi", 2.0, 3.0, T, high=np.inf),
+        sig.DiscretePI(ev, "bounded", 2.0, 3.0, T, low=-0.8, high=1.0),
         sig.DiscretePI(ev, "reverse", -2.0, -3.0, T, low=-1.0, high=0.8),
         sig.Counter(ev, "count", 0.5), sig.Hysteresis(ev, "relay", -0.3, 0.6, low=-2.0, high=5.0),
     ]  # fmt: skip

@@ -1,5 +1,6 @@
 """Blocks that act at instants: sampled controllers, and relays. Inputs are `u`, outputs `y`."""
 
+import math
 from collections.abc import Sequence
 
 import sympy
@@ -25,12 +26,12 @@ class SampleHold(Component):
 
 class DiscretePI(Component):
     """A sampled controller: every `period` (second), y = kp·u + I with I the sum of ki·period·u so far, bounded by
-    `low` and `high`; the sum waits while y is beyond a bound and ki·u drives it further. Gains may be negative. y is 0
-    before the first tick."""
+    `low` and `high` where they are given; the sum waits while y is beyond a bound and ki·u drives it further. Gains may
+    be negative. y is 0 before the first tick."""
 
     def __init__(
         self, ev: EqnEnv, name: str, kp: Value = 1.0, ki: Value = 1.0, period: Value = 0.1,
-        low: Value = -sympy.oo, high: Value = sympy.oo,
+        low: Value | None = None, high: Value | None = None,
     ):  # fmt: skip
         super().__init__(ev, name)
         proportional, integral = self.parameter("kp", kp), self.parameter("ki", ki)
@@ -39,17 +40,23 @@ class DiscretePI(Component):
         held, total = self.discrete("held"), self.discrete("total")
         wished, grows = proportional * u + pre(total), integral * u
         bounded, free = wished, sympy.true
-        if high is not sympy.oo:
+        low, high = _finite(low, -math.inf), _finite(high, math.inf)
+        if high is not None:
             top = self.parameter("high", high)
             bounded, free = sympy.Min(bounded, top), sympy.And(free, sympy.Or(wished <= top, grows <= 0))
-        if low is not -sympy.oo:
+        if low is not None:
             bottom = self.parameter("low", low)
             bounded, free = sympy.Max(bounded, bottom), sympy.And(free, sympy.Or(wished >= bottom, grows >= 0))
-        if high is not sympy.oo and low is not -sympy.oo:
+        if high is not None and low is not None:
             in_order(self, "low", "high")
         self.add_equations(Eq(y, held))
         step = sympy.Piecewise((T * grows, free), (0, True))
         self.when(self.sampled(T), assign(held, bounded), assign(total, pre(total) + step))
+
+
+def _finite(bound: Value | None, none: float) -> Value | None:
+    """The bound; None for the infinite one that does not bound anything."""
+    return None if isinstance(bound, float | sympy.Basic) and bound == none else bound
 
 
 class DiscreteTransferFunction(Component):
