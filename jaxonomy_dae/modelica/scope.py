@@ -240,6 +240,8 @@ class Scope:
             raise ModelError(f"line {d.line}: nothing determines '{d.name}': it has neither an equation nor a when")
         if found is None:  # an input of the model that nothing drives
             start = self._start(d.modifiers.get("start")) or self._least(d.type)
+            if isinstance(start, sympy.Expr):
+                raise ModelError(f"line {d.line}: the start of '{d.name}', an input that nothing drives, is a number")
             return bool(start) if self.kind(d.type) == "Boolean" else int(start)
         return self.defined(d.name, found)
 
@@ -398,7 +400,8 @@ class Scope:
             # One event for each condition, however many columns of a table are read.
             self.ends.add(outside)
             first, last = table.rows[0, 0] + table.shift, table.rows[-1, 0] + table.shift
-            told = f"a table is read outside of [{first:g}, {last:g}], without extrapolation"
+            inside = ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in (first, last))
+            told = f"a table is read outside of [{inside}], without extrapolation"
             self.component.when(self.kept.in_discrete(outside), terminate(told), at_start=True)
         return read(table, column, u, *more)
 

@@ -103,6 +103,19 @@ def test_syntax_errors_say_where(text, where, what):
     assert where in str(error.value) and what in str(error.value)
 
 
+@pytest.mark.parametrize("text", ["within a", 'function f external "C" g(x)'])
+def test_texts_that_end_too_early(text):
+    with pytest.raises(ModelError, match="expected ';', at ''"):
+        read_base(text)
+
+
+def test_escapes_in_strings_and_ranges_without_a_step():
+    assert value_of(r'"a \"b\"\n" + "c"') == 'a "b"\nc'
+    assert value_of("String(true)") == "true"
+    with pytest.raises(ModelError, match="the range 1:0:3 has no step"):
+        value_of("1:0:3")
+
+
 def test_a_text_of_a_megabyte_is_read_in_near_linear_time():
     """Counted in tokens that the reader visits, not in seconds: the list of lines is walked once."""
     body = "".join(f"    Real 'x{k}'(start = {k}.0) \"comment\";\n" for k in range(4000))
