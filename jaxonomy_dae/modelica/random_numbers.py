@@ -91,7 +91,7 @@ def numbers(name: str) -> Callable[..., Numeric]:
     step, count = GENERATORS[name]
 
     def function(*state: Numeric) -> Numeric:
-        if jnp.zeros(()).dtype != jnp.float64:
+        if jnp.result_type(float) != jnp.float64:
             raise ModelError(
                 f"the random generator {name} computes with integers of 64 bits: "
                 'jax.config.update("jax_enable_x64", True)'
