@@ -461,6 +461,15 @@ def test_the_value_before_the_start_of_what_is_not_kept_is_nothing():
     assert "x" in built(text).variables
 
 
+def test_the_value_before_of_what_may_jump_is_refused():
+    """y = 3·d jumps with d, and pre(y) was y itself, 15 instead of 0 here; a state is what it was."""
+    text = """model m Real d(start = 0); Real e(start = 0); Real x(start = 0); Real y; equation der(x) = 1; y = 3 * d;
+      when x > 1 then d = 5; e = pre({}); end when; end m;"""
+    with pytest.raises(ModelError, match=r"pre\(y\): 'y' is neither discrete nor a state"):
+        built(text.format("y"))
+    assert "e" in built(text.format("x")).parameters and "e" in built(text.format("d")).parameters
+
+
 def values_of(text: str) -> dict[str, str]:
     """What the discrete variables of a model become where their `when` acts, by name; `new(n)` is what n becomes."""
     found = {}

@@ -307,3 +307,29 @@ def test_the_log_of_a_run_that_ends_and_of_one_without_events():
     assert found.events.terminated == "the end"
     (value, found), slope = run(0.5, 9.0)
     assert not len(found.events) and found.events.terminated is None and value == slope == 0
+
+
+@pytest.mark.slow
+def test_strict_relations_beside_others():
+    """At t = 1/2 an event sets y from 1 onto 0, where it rests, beside x = 1 and z = 0. `Or(x < 0, y <= 0)` becomes
+    true, and was missed: a guard knew only whether one of its relations is strict. A ball at 1 − t² bounces as ever."""
+
+    def write(self, ev):
+        y, x, z = (self.variable(k, start=s, fixed=True) for k, s in (("y", 1.0), ("x", 1.0), ("z", 0.0)))
+        h, v = self.variable("h", start=1.0, fixed=True), self.variable("v", start=0.0, fixed=True)
+        self.add_equations(*(Eq(der(k), 0) for k in (x, y, z)), Eq(der(h), v), Eq(der(v), -2))
+        self.when(ev.t >= 0.5, reinit(y, 0.0))
+        conditions = (
+            Or(x < 0, y <= 0), Or(x <= 0, y < 0), And(x > 0, y <= 0), And(x >= 0, y < 0), Or(z < 0, y <= -1),
+            sympy.Not(And(x >= 0, y > 0)),
+        )  # fmt: skip
+        for k, condition in enumerate(conditions):
+            n = self.discrete(f"n{k}")
+            self.when(condition, assign(n, pre(n) + 1))
+        bounces = self.discrete("bounces")
+        self.when(And(h <= 0, v < 0), reinit(v, -v / 2), assign(bounces, pre(bounces) + 1))
+
+    run = simulate(compiled(component(write)), 2.25, ts=jnp.array([2.25]), **TIGHT)
+    assert [int(run[f"c.n{k}"][0]) for k in range(6)] == [1, 0, 1, 0, 0, 1]
+    assert int(run["c.bounces"][0]) == 2  # h = 1 − t², then t' − t'² with t' = t − 1
+    assert float(run["c.h"][0]) == pytest.approx(0.125 - 0.25**2, abs=1e-8)
