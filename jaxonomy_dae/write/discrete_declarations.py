@@ -68,8 +68,9 @@ class DiscreteDeclarations(RelationDeclarations):
         if earlier:
             y = earlier[0].path
             raise ModelError(
-                f"{where}({variable}, …): {earlier[0]} is not kept: '{y}' changes between events. Write {y} for what it is "
-                f"at the instant, or let an event assign it to a discrete variable, self.when(…, assign(d, pre({y})))"
+                f"{where}({variable}, …): {earlier[0]} is not kept: '{y}' changes between events. Write {y} for "
+                f"what it is at the instant, or let an event assign it to a discrete variable, "
+                f"self.when(…, assign(d, pre({y})))"
             )
         flows = next(_flowing(found), None)
         if flows is not None:

@@ -333,3 +333,25 @@ def test_strict_relations_beside_others():
     assert [int(run[f"c.n{k}"][0]) for k in range(6)] == [1, 0, 1, 0, 0, 1]
     assert int(run["c.bounces"][0]) == 2  # h = 1 − t², then t' − t'² with t' = t − 1
     assert float(run["c.h"][0]) == pytest.approx(0.125 - 0.25**2, abs=1e-8)
+
+
+@pytest.mark.slow
+def test_guards_that_meet_zero_flatly():
+    """h falls by one a second from h0: each of these guards is zero where h is, at t = h0, and steps are not used up."""
+
+    def write(self, ev):
+        h = self.variable("h", start=self.parameter("h0", 1.0), fixed=True)
+        self.add_equations(Eq(der(h), -1))
+        forms = h**3, (h / 10) ** 3, h**3 + 1e-9 * h, h**5, h * Abs(h), sympy.tanh(h) ** 3, 1e-9 * h, 1e9 * h
+        for k, form in enumerate(forms):
+            self.when(form <= 0, assign(self.discrete(f"at{k}"), ev.t))
+
+    system = compiled(component(write))
+    names = [f"c.at{k}" for k in range(8)]
+
+    def times(h0):
+        of = system.with_parameters({"c.h0": h0})
+        return simulate(of, 2.0, ts=jnp.array([2.0]), max_steps=300, **TIGHT)[names][0]
+
+    np.testing.assert_allclose(times(1.0), 1.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(times))(1.0), 1.0, rtol=0, atol=1e-7)

@@ -226,7 +226,7 @@ def test_a_relief_valve_before_a_long_pipe():
 
 
 def test_a_thermostat_on_a_radiator_whose_resistance_follows_its_temperature():
-    """The element stores no heat: its temperature solves R(T)·σ·(T⁴ − room⁴) = V²."""
+    """The element stores no heat: its temperature solves R(T)·σ·(T⁴ − room⁴) = V², and was found below zero kelvin."""
     ev = EqnEnv()
     source, element, ground = (
         el.SignalVoltage(ev, "source"), el.HeatedResistor(ev, "element", R=100.0, alpha=4e-3), el.Ground(ev, "ground"),
