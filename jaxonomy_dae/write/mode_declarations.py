@@ -91,7 +91,9 @@ class ModeDeclarations(DiscreteDeclarations):
         rate, jump = der(surface), below - above
         part = below / jump
         # Where the fields become equal and change places without leaving the mixture, both lead away from there on.
-        changes = any(isinstance(s, VariableSymbol | DiscreteSymbol | TimeSymbol) for s in jump.free_symbols)
+        changes = any(
+            isinstance(s, VariableSymbol | DiscreteSymbol | TimeSymbol) for s in sympy.sympify(jump).free_symbols
+        )
         drawn = self._hidden_discrete(0.0) if changes else None
 
         def moves(condition: Condition, mode: int, to: Value, flags: EventFlag = NO_FLAG, *others: Assign) -> None:

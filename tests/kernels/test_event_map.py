@@ -170,10 +170,10 @@ def test_an_iteration_that_comes_to_values_again_goes_round_in_a_circle():
         values = rng.integers(0, 3, (n, 4)).astype(float)
         values[:, 0] = np.arange(n)  # all states differ
         count, turning, _ = iterated(values, follows, False)
-        assert 0 < -count <= 3 * (tail + circle) + 1
+        assert 0 < -float(count) <= 3 * (tail + circle) + 1
         round_it = values[tail : tail + circle]
         np.testing.assert_array_equal(turning > 0, (round_it != round_it[0]).any(axis=0))
-        assert iterated(values, follows, True)[0] > 0
+        assert float(iterated(values, follows, True)[0]) > 0
     values = np.arange(60.0)[:, None]
     assert iterated(values, np.minimum(np.arange(1, 61), 59), False)[2][50] == 50
 

@@ -337,7 +337,7 @@ def test_strict_relations_beside_others():
 
 @pytest.mark.slow
 def test_guards_that_meet_zero_flatly():
-    """h falls by one a second from h0: each of these guards is zero where h is, at t = h0, and steps are not used up."""
+    """h falls by one a second from h0: each of these guards is zero where h is, at t = h0. Steps are not used up."""
 
     def write(self, ev):
         h = self.variable("h", start=self.parameter("h0", 1.0), fixed=True)
@@ -355,3 +355,22 @@ def test_guards_that_meet_zero_flatly():
 
     np.testing.assert_allclose(times(1.0), 1.0, rtol=0, atol=1e-9)
     np.testing.assert_allclose(jax.jit(jax.jacrev(times))(1.0), 1.0, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_condition_whose_sides_the_equations_keep_equal_is_named():
+    """s = a + b: `s - a - b <= 0` was silently never true. Beside it, a level that a does not reach, and a value that
+    rests on its level, but need not."""
+
+    def write(self, ev):
+        a, b = self.variable("a", start=1.0, fixed=True), self.variable("b", start=2.0, fixed=True)
+        s, rests = self.variable("s"), self.variable("rests", start=0.0, fixed=True)
+        d, n = self.discrete("d"), self.discrete("n")
+        self.add_equations(Eq(der(a), -1), Eq(der(b), -2), Eq(der(rests), 0), Eq(s, a + b))
+        for condition in (s - a - b <= 0, a >= 5, rests <= 0, d >= 0):
+            self.when(condition, assign(n, pre(n) + 1))
+
+    with pytest.warns(RuntimeWarning) as said:
+        simulate(compiled(component(write)), 1.0)
+    (text,) = [str(w.message) for w in said]
+    assert text.startswith("'c: when(-a - b + s <= 0)' never happens: from t=0 to t=1 both sides")
