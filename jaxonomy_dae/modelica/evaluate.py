@@ -10,7 +10,7 @@ import sympy
 from ..base.errors import ModelError
 from ..write.symbols import VariableSymbol, der
 from . import tree
-from .builtin import FUNCTIONS, applied, matrix_product, numbers_checked
+from .builtin import FUNCTIONS, applied, matrix_power, matrix_product, numbers_checked, rows_joined
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
 from .read_base import FUNCTION
@@ -149,6 +149,8 @@ class Evaluator:
             return RELATIONS[sign](a, b) if sign in ("==", "<>") else RELATIONS[sign](*map(self._compared, (a, b)))
         if sign == "*" and isinstance(a, list) and isinstance(b, list):
             return matrix_product(a, b)
+        if sign == "^" and isinstance(a, list):
+            return matrix_power(a, b)
         if sign == "+" and isinstance(a, str):
             return a + str(b)
         if sign in ("/", "./") and self.guards and isinstance(b, int | float) and b == 0:
@@ -188,9 +190,13 @@ class Evaluator:
         return out
 
     def _comprehension(self, e: tree.Comprehension, names: Names) -> list:
-        (name, over), *rest = e.iterators
+        # `{f(i, j) for i in a, j in b}` is `{{f(i, j) for i in a} for j in b}`: the last iterator counts the rows
+        # (Modelica Language Specification 3.6, section 10.4.1.1).
+        *rest, (name, over) = e.iterators
         values = self._range_of(over, names)
-        inner = tree.Comprehension(e.value, tuple(rest)) if rest else e.value
+        inner: tree.Expression = e.value
+        if rest:
+            inner = tree.Array((tree.Comprehension(e.value, tuple(rest)),))
         return [self.evaluate(inner, _with(names, name, v)) for v in values]
 
     def _range_of(self, e: tree.Expression | None, names: Names) -> list:
@@ -205,11 +211,7 @@ class Evaluator:
         return [first + k * step for k in range(max(count, 0))]
 
     def _matrix(self, e: tree.Matrix, names: Names) -> list:
-        rows = []
-        for row in e.rows:
-            entries = [self.evaluate(x, names) for x in row]
-            rows.append([x for entry in entries for x in (entry if isinstance(entry, list) else [entry])])
-        return rows
+        return rows_joined([[self.evaluate(x, names) for x in row] for row in e.rows])
 
     def _part(self, e: tree.Part, names: Names) -> Value:
         whole = self.evaluate(e.whole, names)

@@ -57,7 +57,7 @@ class AcausalSystem(eqx.Module):
     @property
     def states(self) -> list[str]:
         """The names of the differential states, in the order of the state array."""
-        return [self.plan.quantity_name[q] for q in self.plan.states]
+        return list(self.plan.state_names)
 
     @property
     def carried(self) -> list[str]:
