@@ -104,8 +104,8 @@ FAULTS = [
     ),
     Fault(
         "solve/events/search.py",
-        "middle - towards * radius)",
-        "middle + towards * radius)",
+        "jnp.where(jnp.abs(truncated - middle) <= radius, truncated,",
+        "jnp.where(jnp.abs(truncated - middle) >= radius, truncated,",
         "tests/kernels/test_event_map.py",
     ),
     Fault(

@@ -41,9 +41,10 @@ def differences(f: Callable[[np.ndarray], float], p: np.ndarray, part: float = 1
 
 def compare(
     system: AcausalSystem, names: Sequence[str], values: Sequence[float], read: str, known: Callable, end: float,
-    inputs: dict[str, Any] | None = None,
+    inputs: dict[str, Any] | None = None, part: float = 1e-3,
 ):  # fmt: skip
-    """The variable `read` at the end and its derivatives by the parameters, against the function `known` of these."""
+    """The variable `read` at the end and its derivatives by the parameters, against the function `known` of these, of
+    which differences are taken over such parts of them."""
 
     def last(p):
         given = system.with_parameters(dict(zip(names, p, strict=True)))
@@ -52,5 +53,5 @@ def compare(
     value, slopes = jax.value_and_grad(last)(jnp.array(values))
     p = np.array(values)
     np.testing.assert_allclose(value, known(p), rtol=1e-9)
-    expected = differences(known, p)
+    expected = differences(known, p, part)
     np.testing.assert_allclose(slopes * p, expected * p, rtol=0, atol=1e-7 * np.max(np.abs(expected * p)))
