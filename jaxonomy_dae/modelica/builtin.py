@@ -30,6 +30,7 @@ def _sign(x: float) -> int:
 
 def _quotient(a: Value, b: Value) -> Value:
     """The quotient without its fraction, rounded towards zero."""
+    # The sign needs no event: the whole part beside it is zero where it jumps.
     q = sympy.sympify(a) / sympy.sympify(b)
     return smooth(sympy.sign(q)) * sympy.floor(smooth(sympy.Abs(q)))
 
@@ -46,6 +47,7 @@ def _extreme(smaller: bool) -> Callable[..., Value]:
             return functools.reduce(both if smaller else either, entries)
         if all(isinstance(e, int | float) for e in entries):
             return number(entries)
+        # Unevaluated: SymPy would compare all pairs of entries.
         return smooth(symbol(*entries, evaluate=False))
 
     return extreme
@@ -162,7 +164,7 @@ def _semi_linear(x: Value, positive: Value, negative: Value) -> Value:
 
 
 def _text(value: Value, *_: Value, **__: Value) -> str:
-    return str(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _boolean_as_integer(value: Value) -> Value:
@@ -238,6 +240,7 @@ def numbers_checked(what: Callable[[], str]) -> Iterator[None]:
 
 def power(a: Value, b: Value) -> Value:
     if isinstance(a, int | float) and isinstance(b, int | float):
+        # Python's power of a negative number would be complex.
         found = a**b if a >= 0 or float(b).is_integer() else math.nan
         float(found)  # an integer may be too large to be a Real
         return found
@@ -253,4 +256,5 @@ def quotient(a: Value, b: Value) -> Value:
         return a / b
     if isinstance(b, int | float) and b == 0:
         raise ModelError(f"division of {a} by zero")
+    # Modelica divides Reals, where SymPy would keep a fraction of integers.
     return a / sympy.Float(b) if isinstance(b, int | float) else a / b

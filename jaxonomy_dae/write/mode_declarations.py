@@ -89,6 +89,7 @@ class ModeDeclarations(DiscreteDeclarations):
         branch = sympy.Piecewise(*tried, (below, True))
         self._either(sympy.Eq(side, 0), surface, branch, 1, None)
         rate, jump = der(surface), below - above
+        # `part` is the a of a·above + (1 − a)·below = 0 in what holds the solution on the surface.
         part = below / jump
         # Where the fields become equal and change places without leaving the mixture, both lead away from there on.
         changes = any(
