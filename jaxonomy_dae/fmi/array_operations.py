@@ -7,7 +7,7 @@ import numpy as np
 
 from .c_types import c_type, is_bool, is_float, limits, number
 from .elementwise import ELEMENTWISE, Cell
-from .straight import Kind
+from .straight import Kind, is_uniform
 from .writer import Value, Writer
 
 Params = Mapping[str, Any]
@@ -38,9 +38,14 @@ def _cell(primitive: str, given: Sequence[str], dtype: Any) -> str:
 
 
 def copy(body: Writer, target: Value, source: Value) -> None:
-    """Assigns a scalar or all entries of an array."""
+    """Assigns a scalar or all entries of an array, if they are not the same one."""
+    if target.text == source.text:
+        return
     if not target.kind.shape:
         body.line(f"{target.text} = {source.text};")
+    elif source.known is not None and is_uniform(source.known):
+        with body.loops((target.kind.size,)) as (i,):  # no table of equal numbers
+            body.line(f"{target.at(i)} = {number(source.known.ravel()[0], source.kind.dtype)};")
     elif target.kind.size:
         body.line(f"memcpy({target.text}, {source.text}, {target.kind.size} * sizeof *{target.text});")
 
@@ -128,6 +133,11 @@ def _placed(body: Writer, out: Value, part: Value, axis: int, begin: int, into: 
     with body.loops((rows,)) as (i,):
         base = _affine(i, whole[axis] * inner, begin * inner)
         own = _affine(i, length, 0)
+        if part.known is not None and is_uniform(part.known):
+            with body.loops((length,)) as (k,):
+                place = base if k == "0" else f"{base} + {k}"
+                body.line(f"{out.at(place)} = {number(part.known.ravel()[0], part.kind.dtype)};")
+            return
         if length == 1 or not part.kind.shape:
             target, source = (out.at(base), part.at(own)) if into else (part.at(own), out.at(base))
             body.line(f"{target} = {source};")
@@ -208,6 +218,12 @@ def _index_of(indices: Value, batch: Sequence[str], k: int) -> str:
     return f"(int64_t){indices.at(flat([*batch, str(k)], indices.kind.shape))}"
 
 
+def _are_inside(indices: Value, k: int, last: int) -> bool:
+    """True if component k of all index vectors is known to be from 0 to `last`: nothing is tested then."""
+    found = indices.known
+    return found is not None and bool(np.all((found[..., k] >= 0) & (found[..., k] <= last)))
+
+
 @_emits("gather")
 def _gather(body: Writer, params: Params, given: Sequence[Value], results: Sequence[Value]) -> None:
     (source, indices), (out,) = given, results
@@ -223,9 +239,11 @@ def _gather(body: Writer, params: Params, given: Sequence[Value], results: Seque
         for k, d in enumerate(numbers.start_index_map):
             name = body.name()
             text, last = _index_of(indices, batch, k), shape[d] - sizes[d]
-            body.line(f"const int64_t {name} = {text if drops else _inside(text, last)};")
+            inside = _are_inside(indices, k, last)
+            body.line(f"const int64_t {name} = {text if drops or inside else _inside(text, last)};")
             begin[d] = f"(int){name}"
-            tests.append(f"{name} >= 0 && {name} <= {last}")
+            if not inside:
+                tests.append(f"{name} >= 0 && {name} <= {last}")
         for d, b in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
             begin[d] = batch[b]
         at = [_place(begin.get(d), offset.get(d)) for d in range(len(shape))]
@@ -274,9 +292,11 @@ def _scatters(primitive: str | None) -> Emit:
             for k, d in enumerate(numbers.scatter_dims_to_operand_dims):
                 name = body.name()
                 text, last = _index_of(indices, batch, k), shape[d] - window.get(d, 1)
-                body.line(f"const int64_t {name} = {_inside(text, last) if clips else text};")
+                clipped = clips and not _are_inside(indices, k, last)
+                body.line(f"const int64_t {name} = {_inside(text, last) if clipped else text};")
                 begin[d] = f"(int){name}"
-                tests.append(f"{name} >= 0 && {name} <= {last}")
+                if not _are_inside(indices, k, last):
+                    tests.append(f"{name} >= 0 && {name} <= {last}")
             for d, b in zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True):
                 begin[d] = batch[b]
             at = [_place(begin.get(d), offset.get(d)) for d in range(len(shape))]

@@ -28,13 +28,18 @@ from .array_operations import ARRAY_OPERATIONS
 from .c_types import c_type, number
 from .elementwise import ELEMENTWISE, HELPERS, Cell
 from .linear_algebra import ROUTINES
-from .straight import CALLS, Atom, Constant, Kind, Operation, Straight, function_of, known, straight
+from .straight import CALLS, TABLE, Atom, Constant, Kind, Operation, Straight, function_of, is_uniform, known, straight
 from .writer import Value
 
 SHORT = 32  # entries: arrays up to this length are local to their function, where compilers keep them in registers
 LOCAL = 8192  # bytes that local arrays of one function may take up: targets may have little room on the stack
 ALIGNED = 16  # bytes: a multiple of the size of every number
 ALIASES = {"reshape", "squeeze", "expand_dims"}  # arrays with the entries of another one, in the same order
+# Operations that copy one of the arrays that they read, by its number, and change some entries of it.
+IN_PLACE = {
+    "scatter": 0, "scatter-add": 0, "scatter_add": 0, "scatter-sub": 0, "scatter-mul": 0, "scatter-min": 0,
+    "scatter-max": 0, "dynamic_update_slice": 0, "triangular_solve": 1,
+}  # fmt: skip
 ROUTINES_AND_HELPERS = HELPERS | ROUTINES
 HEADER = "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"
 
@@ -69,7 +74,7 @@ class Source:
         self.helpers: set[str] = set()
         self._tables: dict[tuple[str, bytes], str] = {}
         self._table_texts: dict[str, str] = {}
-        self._written: dict[int, tuple[Any, CFunction]] = {}
+        self._written: dict[Any, tuple[Any, CFunction]] = {}
         self._same: dict[str, CFunction] = {}
 
     def function(self, program: Any, name: str | None = None) -> CFunction:
@@ -80,19 +85,23 @@ class Source:
 
         - `ModelError` that names a primitive that cannot be written in C, and the line that needs it.
         """
-        closed = tuple(map(known, program.consts))
-        return self._write(straight(program.jaxpr), closed, name)
+        return self._write(program.jaxpr, tuple(map(known, program.consts)), name)
 
-    def inner(self, program: Any) -> CFunction:
-        """A program that another one calls, written once; its closed-over values are its first arguments."""
-        if id(program) not in self._written:  # kept with the program, so that no other one gets its identity
-            self._written[id(program)] = program, self._write(straight(program), (), None)
-        return self._written[id(program)][1]
+    def inner(self, program: Any, values: Sequence[Constant | None]) -> CFunction:
+        """A program that another one calls, for these values of its first arguments; None for what is an argument in C,
+        too. Its closed-over values are its first arguments. It is written once for equal values: places of gathers
+        among them are tables, where pointers would leave tests and loops that compute them."""
+        told = tuple(None if v is None else (v.value.dtype, v.value.shape, v.value.tobytes()) for v in values)
+        key = id(program), told
+        if key not in self._written:  # kept with the program, so that no other one gets its identity
+            self._written[key] = program, self._write(program, values, None)
+        return self._written[key][1]
 
-    def _write(self, program: Straight, closed: Sequence[Constant], name: str | None) -> CFunction:
-        body = Body(self, program, closed)
+    def _write(self, jaxpr: Any, values: Sequence[Constant | None], name: str | None) -> CFunction:
+        program = straight(jaxpr, [None if v is None else v.value for v in values])
+        body = Body(self, program, values)
         body.write()
-        arguments = tuple(program.kinds[a] for a in program.arguments[len(closed) :])
+        arguments = tuple(program.kinds[a] for a in body.arguments)
         results = tuple(map(program.kind, program.results))
         signature = ", ".join(_parameters(arguments, results))
         text = f"({signature}) {{\n" + "".join(f"  {line}\n" for line in body.lines) + "}\n"
@@ -150,11 +159,11 @@ def where_written(operation: Operation) -> str:
 class Body:
     """The lines of one function."""
 
-    def __init__(self, source: Source, program: Straight, closed: Sequence[Constant]):
+    def __init__(self, source: Source, program: Straight, values: Sequence[Constant | None]):
         self.source, self.program = source, program
         self.lines: list[str] = []
         self.own = self.inner_work = self.local = 0  # bytes in `w`, those of functions called, and local ones
-        self._indent = 0
+        self._indent = self._now = 0
         self._names = itertools.count()
         self._free: list[tuple[int, int]] = []  # (bytes, offset) of places that nobody reads any more
         self._taken: dict[int, tuple[int, int]] = {}  # by value
@@ -164,12 +173,13 @@ class Body:
         self._declared: dict[str, int] = {}  # the names of local values, and how often they stand where they are made
         self._inputs: list[str] = []  # the names of arguments
         self._group: list[Operation] = []
-        own = program.arguments[len(closed) :]
-        for number_, constant in zip(program.arguments, closed, strict=False):
-            self._constants[number_] = constant
+        for number_, constant in zip(program.arguments, values, strict=False):
+            if constant is not None:
+                self._constants[number_] = constant
+        self.arguments = [a for a in program.arguments if a not in self._constants]
         self._reads: collections.Counter[int] = collections.Counter()  # how often each value is read
         self._last = self._last_uses()
-        for k, argument in enumerate(own):
+        for k, argument in enumerate(self.arguments):
             self._inputs.append(f"a{k}")
             self._values[argument] = Value(f"a{k}", program.kinds[argument])
         self._place = self._result_places()
@@ -215,8 +225,8 @@ class Body:
         value = constant.value
         kind = Kind(value.shape, value.dtype)
         if not kind.shape:
-            return Value(number(value.item(), kind.dtype), kind)
-        return Value(self.source.table(value), kind)
+            return Value(number(value.item(), kind.dtype), kind, value)
+        return Value(self.source.table(value), kind, value)
 
     def known(self, atom: Atom) -> Constant | None:
         return atom if isinstance(atom, Constant) else self._constants.get(atom)
@@ -281,10 +291,9 @@ class Body:
         operations = self.program.operations
         for k, operation in enumerate(operations):
             reads = [self._root(a) for a in operation.given if isinstance(a, int)]
-            is_alias = operation.primitive in ALIASES and isinstance(operation.given[0], int)
-            if is_alias or self._is_part(operation):
+            if self._begins(operation) is not None:
                 assert isinstance(operation.given[0], int)
-                self._alias[operation.results[0]] = self._root(operation.given[0])
+                self._alias.update(dict.fromkeys(operation.results, self._root(operation.given[0])))
             last.update(dict.fromkeys(reads, k))
             self._reads.update(reads)
         self._reads.update(self._root(a) for a in self.program.results if isinstance(a, int))
@@ -294,7 +303,10 @@ class Body:
     def _result_places(self) -> dict[int, int]:
         """Arrays that are computed where a result is wanted, so that they need not be copied."""
         computed = {
-            r for o in self.program.operations if o.primitive not in ALIASES and not self._is_part(o) for r in o.results
+            r
+            for o in self.program.operations
+            if o.primitive not in ALIASES and self._begins(o) is None
+            for r in o.results
         }
         places: dict[int, int] = {}
         for k, atom in enumerate(self.program.results):
@@ -313,6 +325,7 @@ class Body:
     def write(self) -> None:
         """Writes all operations, and the results."""
         for k, operation in enumerate(self.program.operations):
+            self._now = k
             self._operation(operation)
             self._release(k)
         self._flush()
@@ -358,25 +371,39 @@ class Body:
             return
         if reads_pending:
             self._flush()
-        if name == "slice" and self._is_part(operation):
-            given, inner = self.value(operation.given[0]), int(np.prod(kinds[0].shape[1:], dtype=int))
-            begin = operation.params["start_indices"][0] * inner
-            self._values[operation.results[0]] = Value(f"({given.text} + {begin})" if begin else given.text, kinds[0])
-            return
         if name in ALIASES:
             given = self.value(operation.given[0])
             self._alias_of(operation.results[0], given, kinds[0])
             return
+        begins = self._begins(operation)
+        if begins is not None:
+            given = self.value(operation.given[0])
+            for result, begin, kind in zip(operation.results, begins, kinds, strict=True):
+                text = f"({given.text} + {begin})" if begin and kind.shape else given.text
+                self._values[result] = Value(text if kind.shape else f"{given.text}[{begin}]", kind)
+            return
         self._other(operation, kinds)
 
-    def _is_part(self, operation: Operation) -> bool:
-        """True for a slice whose entries stand together in what it is cut from."""
-        if operation.primitive != "slice" or not isinstance(operation.given[0], int):
-            return False
-        if operation.given[0] in self._constants or any(step != 1 for step in operation.params["strides"] or ()):
-            return False
-        shape, out = self.program.kind(operation.given[0]).shape, self.program.kinds[operation.results[0]].shape
-        return shape[1:] == out[1:] and 0 not in shape
+    def _begins(self, operation: Operation) -> list[int] | None:
+        """For results whose entries stand together in what the operation reads first: where each of them begins. They
+        have no place of their own."""
+        if (
+            not isinstance(operation.given[0] if operation.given else None, int)
+            or operation.given[0] in self._constants
+        ):
+            return None
+        name, params, shape = operation.primitive, operation.params, self.program.kind(operation.given[0]).shape
+        if name in ALIASES:
+            return [0]
+        kinds = [self.program.kinds[r] for r in operation.results]
+        if name == "slice":
+            if any(step != 1 for step in params["strides"] or ()) or shape[1:] != kinds[0].shape[1:] or 0 in shape:
+                return None
+            return [params["start_indices"][0] * int(np.prod(shape[1:], dtype=int))]
+        if name in ("split", "unstack") and all(n == 1 for n in shape[: params["axis"]]) and 0 not in shape:
+            sizes = [kind.size for kind in kinds]
+            return [sum(sizes[:k]) for k in range(len(sizes))]
+        return None
 
     def _alias_of(self, result: int, given: Value, kind: Kind) -> None:
         if bool(given.kind.shape) == bool(kind.shape):
@@ -401,7 +428,7 @@ class Body:
         if operation.primitive == "slice":
             (begin, *others), (end, *_) = operation.params["start_indices"], operation.params["limit_indices"]
             step = (operation.params["strides"] or (1,))[0]
-            return None if others or end <= begin or self._is_part(operation) else np.arange(begin, end, step)
+            return None if others or end <= begin or self._begins(operation) else np.arange(begin, end, step)
         if operation.primitive != "gather":
             return None
         places, numbers = self.known(operation.given[1]), operation.params["dimension_numbers"]
@@ -476,7 +503,7 @@ class Body:
             if isinstance(atom, int) and atom in inside:
                 return inside[atom]
             constant = self.known(atom)
-            if constant is not None and constant.value.size and _is_uniform(constant.value):
+            if constant is not None and is_uniform(constant.value):
                 return number(constant.value.ravel()[0], constant.value.dtype)  # no table of equal numbers
             value = self.value(atom)
             return value.at(_repeated("i", value.kind.shape, kind.shape))
@@ -494,6 +521,23 @@ class Body:
                 self.line(f"const {c_type(own.dtype)} {name} = {text};")
                 if result in stored:
                     self.line(f"{stored[result].text}[i] = {name};")
+
+    def _taken_over(self, operation: Operation) -> Value | None:
+        """For an operation that changes some entries of an array: this array, if nobody reads it afterwards."""
+        (result, *others), given = operation.results, operation.given[IN_PLACE[operation.primitive]]
+        if others or result in self._place or not isinstance(given, int) or given in self._constants:
+            return None
+        root, value, kind = self._root(given), self._values[given], self.program.kinds[result]
+        read = [self._root(a) for a in operation.given if isinstance(a, int)]
+        read += [self._root(a) for o in self._group for a in o.given if isinstance(a, int)]
+        if self._last.get(root) != self._now or read.count(root) > 1 or value.text not in self._declared:
+            return None
+        if kind.size != self.program.kinds[root].size or not kind.shape or value.text.startswith("o"):
+            return None
+        if root in self._taken:
+            self._taken[result] = self._taken.pop(root)
+        self._values[result] = found = Value(value.text, kind)
+        return found
 
     def _result(self, result: int) -> Value:
         """A place for a value that is computed."""
@@ -516,10 +560,11 @@ class Body:
         if name not in CALLS and name not in ARRAY_OPERATIONS:
             raise self._refused(operation)
         given = [self.value(a) for a in operation.given]
-        results = [self._result(r) for r in operation.results]
+        results = [self._taken_over(operation)] if name in IN_PLACE else []
+        results = [r for r in results if r] or [self._result(r) for r in operation.results]
         if name in CALLS:
             program, closed = function_of(operation)
-            self.apply(program, [*(self.constant(known(c)) for c in closed), *given], results)
+            self.apply(program, closed, given, results)
         else:
             try:
                 ARRAY_OPERATIONS[name](self, operation.params, given, results)
@@ -527,32 +572,35 @@ class Body:
                 raise self._refused(operation) from None
         self._declared |= {v.text: 2 for r, v in zip(operation.results, results, strict=True) if r not in self._place}
 
-    def apply(self, program: Any, given: Sequence[Value], results: Sequence[Value]) -> None:
-        """Calls a program with values."""
-        self.call(self.source.inner(program), [v.text for v in given], [v.pointer for v in results])
+    def apply(self, program: Any, closed: Sequence[Any], given: Sequence[Value], results: Sequence[Value]) -> None:
+        """Calls a program with what it closes over and values. What it closes over is part of what is called, and so
+        are integers that are known."""
+        values = [*map(known, closed), *map(_known_integers, given)]
+        passed = [v.text for v, value in zip(given, values[len(closed) :], strict=True) if value is None]
+        self.call(self.source.inner(program, values), passed, [v.pointer for v in results])
 
     def apply_closed(self, program: Any, given: Sequence[Value], results: Sequence[Value]) -> None:
         """Calls a closed program with values."""
-        closed = [self.constant(known(c)) for c in program.consts]
-        self.apply(program.jaxpr, [*closed, *given], results)
+        self.apply(program.jaxpr, program.consts, given, results)
+
+
+def _known_integers(value: Value) -> Constant | None:
+    found = value.known
+    return None if found is None or found.dtype.kind not in "iub" or found.size > TABLE else Constant(found)
 
 
 def _repeated(i: str, own: Sequence[int], shape: Sequence[int]) -> str:
     """The number of the entry that stands for entry i of a shape, along whose axes an array may have one entry only."""
     if tuple(own) == tuple(shape) or not own:
         return i
-    terms, inner, own_inner = [], 1, 1
+    terms, inner, own_inner, total = [], 1, 1, int(np.prod(shape))
     for n, m in zip(reversed(shape), reversed(own), strict=True):
         if m != 1:
             digit = i if inner == 1 else f"{i} / {inner}"
-            terms.append(f"{digit} % {n} * {own_inner}")
+            digit = digit if inner * n == total else f"{digit} % {n}"
+            terms.append(digit if own_inner == 1 else f"{digit} * {own_inner}")
         inner, own_inner = inner * n, own_inner * m
     return " + ".join(terms) or "0"
-
-
-def _is_uniform(value: np.ndarray) -> bool:
-    first = value.ravel()[:1].tobytes()
-    return value.tobytes() == first * value.size
 
 
 def _words(text: str) -> list[str]:
