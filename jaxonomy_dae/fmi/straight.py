@@ -315,3 +315,13 @@ def _needed(operations: Sequence[Operation], results: Sequence[Atom]) -> tuple[O
         kept.append(operation)
         needed.update(a for a in operation.given if isinstance(a, int))
     return tuple(reversed(kept))
+
+
+def where_written(operation: Operation) -> str:
+    """The line of a user's code that an operation comes from: the innermost one outside of JAX and of this package."""
+    traceback = getattr(operation.source, "traceback", None)
+    for frame in getattr(traceback, "frames", ()):
+        file = frame.file_name.replace("\\", "/")
+        if "/site-packages/" not in file and "/jaxonomy_dae/" not in file and not file.startswith("<"):
+            return f" ({file}:{frame.line_num}, in {frame.function_name})"
+    return ""
