@@ -64,7 +64,8 @@ def linearize(
     **Raises:**
 
     - `ModelError` for unknown names, an input without a value, an input that the model differentiates (its response has
-        no state space), and `states` that are not coordinates.
+        no state space), `states` that are not coordinates, and a point at which hidden constraints do not hold, as one
+        found for other parameters.
     - `ModelError` for a model that depends on variables written by clocks, without `sampled`; with `sampled`, if the
         model has no clock or no common period; and at a point where an event is about to change the model. Inside jit,
         not-a-number stands for errors that depend on values.
@@ -81,6 +82,7 @@ def linearize(
     if at is None:
         found, t, read = equilibrium_from(system, t, given, None, Drifting(), throw=None)
         at = point_of(system, found, t, read, drifting=Drifting(), singular_is_error=False, throw=None)
+    # Each member of a batch may have coordinates of its own, and so other states.
     if jnp.ndim(at.x) != 1:
         raise ModelError("the operating point is a batch: linearize each with equinox.filter_vmap")
     values = read_inputs(system.plan, dtype, {**by_entry(system.plan, at.inputs), **given})
@@ -89,11 +91,24 @@ def linearize(
     point = Driven(at.t, at.x, q, values, u, tuple(names), tuple(outputs))
     arguments = (system, point, tuple(quantity.tolist()), tuple(factor.tolist()))
     partials = partials_at(*arguments) if is_staged(arguments) else compiled_partials(*arguments)
-    partials = _smooth(system, partials)
+    partials = _smooth(system, _consistent(system, partials))
     coordinates = _coordinates(system, partials, states)
     if sampled:
         return sampled_space(system, point, partials, coordinates)
     return _reduced(system, point, _between_ticks(system, partials), coordinates)
+
+
+def _consistent(system: AcausalSystem, partials: Partials) -> Partials:
+    """The partial derivatives, if the hidden constraints hold at the point."""
+    off = jnp.any(partials.off)
+    if not is_traced(off) and bool(off):
+        constraints = system.plan.selection.constraints[np.asarray(partials.off)]
+        texts = some([system.plan.describe(int(e)) for e in constraints])
+        raise ModelError(
+            f"the point is not one of this system: {texts} does not hold there. Find it with the same parameters, "
+            "inputs and time, at=steady_state(system, ...)"
+        )
+    return jax.tree.map(lambda leaf: _where(~off, leaf), partials)
 
 
 def _smooth(system: AcausalSystem, partials: Partials) -> Partials:
@@ -153,6 +168,7 @@ def _coordinates(system: AcausalSystem, partials: Partials, wanted: Sequence[str
         if wanted is not None and set(wanted) != set(system.states):
             raise ModelError(f"states: no hidden constraint makes a state redundant; all are needed: {system.states}")
         return Coordinates(np.arange(n), np.arange(0), np.arange(0))
+    # In units of nominal sizes: which entry is large must not depend on the units of states.
     scaled = None if is_traced(h_x) else np.asarray(h_x) * np.asarray(system.plan.nominal[:n])
     chosen = None if scaled is None else choose_coordinates(scaled)
     if wanted is None:
@@ -167,6 +183,7 @@ def _coordinates(system: AcausalSystem, partials: Partials, wanted: Sequence[str
     rows = np.arange(c) if chosen is None else chosen.rows
     if len(set(kept)) != n - len(rows):
         raise ModelError(f"states: {n - len(rows)} coordinates are needed, of {system.states}; got {list(wanted)}")
+    # The states named are coordinates if those that are left can be eliminated.
     if scaled is not None and len(choose_coordinates(scaled[rows], dependent).dependent) < len(rows):
         raise ModelError(
             f"states: {list(wanted)} do not determine the other states at this point; "
