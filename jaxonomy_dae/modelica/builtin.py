@@ -164,7 +164,7 @@ def _semi_linear(x: Value, positive: Value, negative: Value) -> Value:
 
 
 def _text(value: Value, *_: Value, **__: Value) -> str:
-    return str(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _boolean_as_integer(value: Value) -> Value:

@@ -19,6 +19,23 @@ from .values import Record, Results, Value, both, chosen, either, entrywise, is_
 Names = Callable[[str], Value]  # the value of a name; raises KeyError for an unknown one
 
 
+class Quieted:
+    """Conditions that stand in noEvent everywhere. One that stands elsewhere, too, is an event there."""
+
+    def __init__(self):
+        self.within: set[Value] = set()
+        self.elsewhere: set[Value] = set()
+
+    def __contains__(self, condition: object) -> bool:
+        return condition in self.within and condition not in self.elsewhere
+
+    def __iter__(self) -> Iterator[Value]:
+        return iter(self.within - self.elsewhere)
+
+    def __len__(self) -> int:
+        return len(self.within - self.elsewhere)
+
+
 class Evaluator:
     """Evaluates the expressions of a flat model. `call` carries out functions.
 
@@ -46,7 +63,7 @@ class Evaluator:
         self.special, self.externals = special, externals
         self.literals = literal_numbers(classes)
         self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
-        self.quieted: set[sympy.Basic] = set()  # conditions that stood in noEvent
+        self.quieted = Quieted()
         self.named, self.opaque = named, opaque
         self.depth = 0
         self.guards: list[Value] = []  # conditions that are not constant, around what is carried out
@@ -149,7 +166,11 @@ class Evaluator:
             return entrywise(both if sign == "and" else either, a, self.evaluate(e.right, names))
         a, b = self.evaluate(e.left, names), self.evaluate(e.right, names)
         if sign in RELATIONS:
-            return RELATIONS[sign](a, b) if sign in ("==", "<>") else RELATIONS[sign](*map(self._compared, (a, b)))
+            sides = (a, b) if sign in ("==", "<>") else map(self._compared, (a, b))
+            found = RELATIONS[sign](*sides)
+            if not self.quiet:
+                self.quieted.elsewhere.add(found)
+            return found
         if sign == "*" and isinstance(a, list) and isinstance(b, list):
             return matrix_product(a, b)
         if sign == "^" and isinstance(a, list):
@@ -211,6 +232,8 @@ class Evaluator:
 
     def _range(self, e: tree.Range, names: Names) -> list:
         first, step, last = (self.constant(x, names) for x in (e.first, e.step, e.last))
+        if step == 0:
+            raise ModelError(f"the range {first}:0:{last} has no step")
         count = math.floor(round((last - first) / step, 6)) + 1  # rounding: 0.3 / 0.1 is below 3
         return [first + k * step for k in range(max(count, 0))]
 
@@ -262,7 +285,7 @@ class Evaluator:
         finally:
             self.quiet = before
         if is_condition(value) and not isinstance(value, bool):
-            self.quieted.add(value)
+            self.quieted.within.add(value)
         return value
 
     def _applied(self, e: tree.Expression, names: Names) -> Value:

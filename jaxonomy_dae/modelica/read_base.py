@@ -7,7 +7,7 @@ Annotations are passed over, but for that of a model, which says how to run it.
 from collections.abc import Iterator
 
 from . import tree
-from .read_expressions import ExpressionReader
+from .read_expressions import ExpressionReader, unescaped
 
 PREFIXES = frozenset(
     "parameter constant discrete input output final flow stream inner outer each protected public redeclare "
@@ -44,7 +44,7 @@ class Reader(ExpressionReader):
     def comment(self) -> str:
         out = ""
         while self.kinds[self.i] == "string":
-            out = self.words[self.i][1:-1]
+            out += unescaped(self.words[self.i])
             self.i += 1
             if not self.take("+"):
                 break
@@ -57,6 +57,13 @@ class Reader(ExpressionReader):
             if self.kinds[self.i] == "stop":
                 self._fail("expected ')'")
             depth += {"(": 1, ")": -1}.get(self.keys[self.i], 0)
+            self.i += 1
+
+    def pass_to(self, sign: str) -> None:
+        """Goes past the next one of this sign."""
+        while not self.take(sign):
+            if self.kinds[self.i] == "stop":
+                self._fail(f"expected '{sign}'")
             self.i += 1
 
     def pass_annotation(self) -> None:
@@ -177,8 +184,7 @@ class Reader(ExpressionReader):
 
     def file(self) -> tree.Class:
         if self.take("within"):
-            while not self.take(";"):
-                self.i += 1
+            self.pass_to(";")
         out = self.definition()
         self.take(";")
         if self.kinds[self.i] != "stop":
@@ -313,6 +319,8 @@ class Reader(ExpressionReader):
             self.i += 1
         called = ""
         while not self.take(";"):
+            if self.kinds[self.i] == "stop":
+                self._fail("expected ';'")
             if self.keys[self.i + 1] == "(" and self.kinds[self.i] == "word" and not called:
                 called = self.words[self.i]
             if self.at("annotation"):

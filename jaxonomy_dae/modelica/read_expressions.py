@@ -24,6 +24,14 @@ _QUOTED = r"'(?:[^'\\]|\\.)*'"
 _PART = re.compile(rf"([^\[\]]+)(?:\[((?:{_QUOTED}|\[(?:{_QUOTED}|[^\[\]'])*\]|[^\[\]'])*)\])?\.?")
 
 
+_ESCAPED = {"n": "\n", "t": "\t", "r": "\r", "a": "\a", "b": "\b", "f": "\f", "v": "\v"}
+
+
+def unescaped(string: str) -> str:
+    """The text between the quotation marks of a string, with its escapes carried out (section 2.4.3)."""
+    return re.sub(r"\\(.)", lambda found: _ESCAPED.get(found[1], found[1]), string[1:-1], flags=re.S)
+
+
 def written(name: str) -> tree.Reference:
     """A quoted name with subscripts inside, such as 'x[\\'i\\'].y', as the reference x[i].y."""
     parts: list[str] = []
@@ -181,7 +189,7 @@ class ExpressionReader:
             return tree.Number(int(word) if word.isdigit() else float(word))
         if kind == "string":
             self.i += 1
-            return tree.Text(word[1:-1])
+            return tree.Text(unescaped(word))
         if kind == "sign":
             if self.take("("):
                 return self._in_parentheses()

@@ -248,9 +248,11 @@ class Sources:
         return None
 
     def _imported(self, scope: Found, name: str) -> Member | None:
+        # A qualified import comes before what a whole package brings (section 5.3.1).
+        qualified = next((full for local, full in scope.source.imports if local == name), None)
+        if qualified is not None:
+            return self.find(qualified)
         for local, full in scope.source.imports:
-            if local == name:
-                return self.find(full)
             if local == "*":
                 package = self.find(full)
                 found = self.member(package, name) if isinstance(package, Found) else None
