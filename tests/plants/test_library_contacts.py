@@ -365,6 +365,8 @@ def test_two_capacitors_joined():
 def test_a_run_that_cannot_begin_in_its_mode(bob):
     with pytest.raises(jd.InitializationError, match=r"cannot begin at t=0 in the mode of 'bob: L - sqrt"):
         simulate(bob, 1.0, initial={"bob.y": -0.7})
+    with pytest.raises(jd.InitializationError, match=r"where 'bob: L - sqrt.* has no finite derivatives"):
+        simulate(bob.with_parameters({"bob.taut": 0.0}), 1.0, initial={"bob.y": 0.0})
     stop = falling(HardStop(EqnEnv(), "stop", touching=True))
     with pytest.raises(jd.InitializationError, match="it is 1, its derivative 0"):
         simulate(stop, 1.0)
