@@ -1,5 +1,6 @@
 """Events as they are declared: what is refused, and what is said of it."""
 
+import jax.numpy as jnp
 import pytest
 import sympy
 from problems import compiled, component
@@ -151,3 +152,13 @@ def test_a_jump_inside_a_condition_is_an_event():
     # A kink that does not jump is still left alone there.
     (left,) = relations_left_alone(w - sympy.Piecewise((1, sympy.Abs(w) >= 1), (0, True)))
     assert left.args[0] == sympy.Abs(w)
+
+
+def test_a_relation_in_which_time_cancels():
+    """Of a·(t + 1) − a·t > ½ nothing is left that turns: it was divided by its slope in time, zero."""
+
+    def write(c, ev):
+        a, x = c.parameter("a", 2.0), c.variable("x", start=0.0, fixed=True)
+        c.add_equations(Eq(der(x), sympy.Piecewise((a, a * (ev.t + 1) - a * ev.t > 0.5), (0, True))))
+
+    assert compiled(component(write)).vector_field(0.0, jnp.zeros(1)) == 2.0
