@@ -71,6 +71,18 @@ class VariableSymbol(ComponentSymbol):
         return (self.path, self.order), {}
 
 
+class EarlierSymbol(VariableSymbol):
+    """A variable before the event that is being handled, in what an event writes."""
+
+    __slots__ = ()
+
+    @functools.lru_cache(maxsize=65536)  # noqa: B019
+    def __new__(cls, path: str, order: int = 0):
+        symbol = ComponentSymbol.__new__(cls, f"pre({'der(' * order}{path}{')' * order})", real=True)
+        symbol.path, symbol.order = path, order
+        return symbol
+
+
 class ParameterSymbol(ComponentSymbol):
     """A parameter seen from one component."""
 

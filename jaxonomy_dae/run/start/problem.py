@@ -105,7 +105,8 @@ class InitialProblem:
     def _at(self, parameters: Any, inputs: Any, w: Any) -> SystemAt:
         if len(self.unknown):
             parameters = self._table.complete(parameters.at[self.unknown].set(w[self.plan.n_state :]))
-        return SystemAt(self.plan, parameters, self.point.networks, self.t0, inputs, self.point.typical)
+        once = self.point.once
+        return SystemAt(self.plan, parameters, self.point.networks, self.t0, inputs, self.point.typical, once)
 
     def residual(self, w: Any, moving: tuple[Any, Any, Any]) -> Any:
         """F(w), shape (m,), with parameters, inputs and targets."""
