@@ -58,7 +58,7 @@ class Filter:
             )
         for name, value in self.noise.items():
             _check(f"Filter: noise of '{name}'", value, positive=True)
-        whole_number(self.substeps, "Filter: substeps")
+        object.__setattr__(self, "substeps", whole_number(self.substeps, "Filter: substeps"))
 
 
 @explained
