@@ -78,8 +78,8 @@ def check_steps(s: Stacked) -> None:
             gaps = steps_between(s.times[k, : s.counts[k]])(np.flatnonzero(s.observed[k, : s.counts[k], j]))
             if not np.array_equal(gaps, np.rint(gaps)):
                 raise ModelError(
-                    f"{label}: the samples of '{s.outputs[j]}' are not whole sampling steps apart, and rho = {s.rho[j]:g} "
-                    "of its noise, below zero, has a meaning over whole steps alone: resample(times), or leave rho out"
+                    f"{label}: the samples of '{s.outputs[j]}' are not whole sampling steps apart, over which alone "
+                    f"rho = {s.rho[j]:g} of its noise, below zero, has a meaning: resample(times), or leave rho out"
                 )
 
 

@@ -157,6 +157,9 @@ class Problem:
         self.method = checked_method(system, method)
         self.delay = by_name("delay", delay, "'motor.u': Unknown(0.1)")
         self._stacked = self._read(self.data, None)
+        unseen = [n for n in self.observers if n in self.trained[1] and n not in self._stacked.outputs]
+        if unseen:
+            raise ModelError(f"train: there are no data of '{unseen[0]}' to train its sensor law with")
         self._layout = self.layout_of(self._stacked)
         unknown = [*self.trained[0], *self._layout.shared, *self._layout.own]
         table = system.parameters.table
@@ -175,11 +178,7 @@ class Problem:
 
     def _read(self, data: Data | Experiment, like: Stacked | None) -> Stacked:
         whole = data if isinstance(data, Data) else Data(data)
-        stacked = stack(whole, self.system.plan, tuple(self.observers), self.starts, like)
-        unused = [name for name in self.observers if name not in stacked.outputs]
-        if unused and unused[0] in self.trained[1]:
-            raise ModelError(f"train: there are no data of '{unused[0]}' to train its sensor law with")
-        return stacked
+        return stack(whole, self.system.plan, tuple(self.observers), self.starts, like)
 
     def layout_of(self, stacked: Stacked) -> Layout:
         """The names of arguments and results of a program for these data."""

@@ -31,7 +31,8 @@ def followed(
     s = objective.stacked
     names, k = named(objective, names, experiment)
     count = s.counts[k]
-    if whole_number(steps, "steps") > count:
+    steps = whole_number(steps, "steps")
+    if steps > count:
         raise ModelError(f"steps is a whole number from 1 to the {count} samples of this experiment; got {steps!r}")
     found = jax.tree.map(lambda a: a[k, :count], objective.predictions(point))
     first = 0

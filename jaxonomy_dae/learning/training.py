@@ -173,6 +173,8 @@ def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSt
     held_out = bool(objective.stacked.holdout.any())
     if plan.patience is not None and not held_out:
         raise ModelError("patience needs experiments that are held out: Experiment(..., holdout=True)")
+    if plan.checkpoint is not None and not Path(plan.checkpoint).parent.is_dir():
+        raise ModelError(f"checkpoint: there is no folder for '{plan.checkpoint}': make it first")
     low, high = objective.limits
     near = silent(objective, start)
     stages = {share: Batches(objective.until(share, near), plan.batch, plan.seed) for share in plan.horizons}
