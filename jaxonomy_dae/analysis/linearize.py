@@ -64,7 +64,8 @@ def linearize(
     **Raises:**
 
     - `ModelError` for unknown names, an input without a value, an input that the model differentiates (its response has
-        no state space), and `states` that are not coordinates.
+        no state space), `states` that are not coordinates, and a point at which hidden constraints do not hold, as one
+        found for other parameters.
     - `ModelError` for a model that depends on variables written by clocks, without `sampled`; with `sampled`, if the
         model has no clock or no common period; and at a point where an event is about to change the model. Inside jit,
         not-a-number stands for errors that depend on values.
@@ -90,11 +91,24 @@ def linearize(
     point = Driven(at.t, at.x, q, values, u, tuple(names), tuple(outputs))
     arguments = (system, point, tuple(quantity.tolist()), tuple(factor.tolist()))
     partials = partials_at(*arguments) if is_staged(arguments) else compiled_partials(*arguments)
-    partials = _smooth(system, partials)
+    partials = _smooth(system, _consistent(system, partials))
     coordinates = _coordinates(system, partials, states)
     if sampled:
         return sampled_space(system, point, partials, coordinates)
     return _reduced(system, point, _between_ticks(system, partials), coordinates)
+
+
+def _consistent(system: AcausalSystem, partials: Partials) -> Partials:
+    """The partial derivatives, if the hidden constraints hold at the point."""
+    off = jnp.any(partials.off)
+    if not is_traced(off) and bool(off):
+        constraints = system.plan.selection.constraints[np.asarray(partials.off)]
+        texts = some([system.plan.describe(int(e)) for e in constraints])
+        raise ModelError(
+            f"the point is not one of this system: {texts} does not hold there. Find it with the same parameters, "
+            "inputs and time, at=steady_state(system, ...)"
+        )
+    return jax.tree.map(lambda leaf: _where(~off, leaf), partials)
 
 
 def _smooth(system: AcausalSystem, partials: Partials) -> Partials:

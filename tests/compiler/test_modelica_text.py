@@ -4,6 +4,7 @@ import math
 import re
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 import sympy
@@ -14,7 +15,7 @@ from jaxonomy_dae.graph.expressions.smooth import Smooth
 from jaxonomy_dae.modelica import FlatComponent, load, read_base
 from jaxonomy_dae.modelica.interpret import Interpreter
 from jaxonomy_dae.modelica.left_out import LEFT_OUT, time_table_coefficients
-from jaxonomy_dae.modelica.random_numbers import GENERATORS, number
+from jaxonomy_dae.modelica.random_numbers import GENERATORS, number, numbers
 from jaxonomy_dae.modelica.semi_linear import with_chains_solved
 from jaxonomy_dae.modelica.tables import Table, table_1d
 from jaxonomy_dae.modelica.tree import Binary, Call, Number, Reference, Unary
@@ -286,6 +287,11 @@ def test_generators_of_random_numbers(name, count):
         assert (r, state) == expected
         found.append(r)
     assert np.mean(found) == pytest.approx(0.5, abs=0.05) and np.var(found) == pytest.approx(1 / 12, abs=0.01)
+
+
+def test_random_numbers_need_integers_of_64_bits():
+    with jax.enable_x64(False), pytest.raises(ModelError, match="xorshift64star computes with integers of 64 bits"):
+        numbers("xorshift64star")(123456789.0, -987654321.0)
 
 
 def test_chains_of_semi_linear_have_a_solution_at_rest():

@@ -2,6 +2,7 @@
 
 from sympy import Min, exp
 
+from ...base.errors import ModelError
 from ...write import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Thermal, Value, der, smooth
 from ..arguments import start_of
 from .two_pin import TwoPin, TwoPorts
@@ -62,8 +63,12 @@ class Inductor(TwoPin):
 class MutualInductor(TwoPorts):
     """Two coupled coils: v1 = L1·di1/dt + M·di2/dt, v2 = M·di1/dt + L2·di2/dt.
 
-    `L1`, `L2` > 0 and the mutual inductance `M` in henry, M² < L1·L2. Given initial currents (ampere) hold at the
-    start.
+    `L1`, `L2` > 0 and the mutual inductance `M` in henry, M² < L1·L2: else the coils would store negative energy. Given
+    initial currents (ampere) hold at the start.
+
+    **Raises:**
+
+    - `ModelError` for numbers with M² ≥ L1·L2.
     """
 
     def __init__(
@@ -80,6 +85,13 @@ class MutualInductor(TwoPorts):
         first = self.parameter("L1", L1, unit="H", bounds=POSITIVE)
         second = self.parameter("L2", L2, unit="H", bounds=POSITIVE)
         mutual = self.parameter("M", M, unit="H")
+        own1, own2, shared = (self.parameters[k].value for k in ("L1", "L2", "M"))
+        if isinstance(own1, float) and isinstance(own2, float) and isinstance(shared, float):
+            if shared**2 >= own1 * own2:
+                raise ModelError(
+                    f"'{name}': M² must be below L1·L2; got M={shared:g} with L1={own1:g} and L2={own2:g}: for coils "
+                    "that share all of their flux, take IdealTransformer, with an Inductor beside one of its sides"
+                )
         given = ("1", initial_current1), ("2", initial_current2)
         starts = {f"i{k}": start_of(self, f"initial_current{k}", start, "A") for k, start in given}
         v1, i1, v2, i2 = self._two_ports(**starts)

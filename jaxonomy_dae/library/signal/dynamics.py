@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from ...base.errors import ModelError
 from ...write import POSITIVE, Component, Eq, EqnEnv, Value, der
-from ..arguments import count, finite, row, start_of
+from ..arguments import coefficients, count, finite, row, start_of
 
 
 class Integrator(Component):
@@ -109,8 +109,8 @@ class TransferFunction(Component):
 
     def __init__(self, ev: EqnEnv, name: str, numerator: ArrayLike, denominator: ArrayLike):
         super().__init__(ev, name)
-        top = np.atleast_1d(finite(numerator, name, "numerator"))
-        bottom = np.atleast_1d(finite(denominator, name, "denominator"))
+        top = coefficients(numerator, name, "numerator")
+        bottom = coefficients(denominator, name, "denominator")
         if not len(top):
             raise ModelError(f"'{name}': the numerator needs at least one coefficient; got none")
         if not len(bottom) or bottom[0] == 0.0:
