@@ -114,7 +114,7 @@ class Experiment:
                 out[name] = math.nan
             elif not isinstance(value, str) and is_finite(value) and value > 0:
                 out[name] = float(value)
-            elif isinstance(value, list | tuple) or hasattr(value, "shape"):
+            elif not isinstance(value, str) and (isinstance(value, list | tuple) or hasattr(value, "shape")):
                 out[name] = _levels_of(name, value, samples)
             elif isinstance(value, Noise):
                 scale = None if value.scale is None else _levels_of(name, value.scale, samples)
