@@ -106,24 +106,20 @@ def test_correlations_are_those_of_neighbours():
 
 def test_numbers_of_numpy_and_jax_are_numbers():
     """Those of JAX were refused, with words that were not true; a start known so was kept at a window's start."""
-    known = {"tank.level": jnp.asarray(np.array(2.0)), "tank.k": np.array(0.3)}
-    sigma = jnp.asarray(0.1 + 0.01 * AT)
-    one = Experiment(
-        AT,
-        {"tank.level": AT},
-        t0=jnp.asarray(np.array(1.0)),
-        weight=np.array(2.0),
-        initial=known,
-        inputs={"tank.u": jnp.asarray(np.array(1.0))},
-    )
-    assert (one.t0, one.weight, one.initial) == (1.0, 2.0, {"tank.level": 2.0, "tank.k": 0.3})
-    np.testing.assert_array_equal(
-        Experiment(AT, {"tank.level": AT}, sigma=sigma).sigma["tank.level"], np.asarray(sigma)
-    )
-    assert Experiment(AT, {"tank.level": AT}, sigma=jnp.asarray(np.array(0.1))).sigma["tank.level"] == 0.1 and Unknown(
-        jnp.asarray(np.array(2.0))
-    ) == Unknown(2.0)
-    with pytest.raises(ModelError, match="'tank.level' is known at 1, not at 2"):
+
+    def number(x: float) -> Any:
+        return jnp.asarray(np.array(x))
+
+    levels, count = jnp.asarray(0.1 + 0.01 * AT), np.int64(2)
+
+    def given(**others: Any) -> Experiment:
+        return Experiment(AT, {"c.x": AT}, **others)
+
+    known = {"c.x": number(2.0), "c.k": np.array(0.3)}
+    one = given(t0=number(1.0), weight=np.array(2.0), initial=known)
+    assert (one.t0, one.weight, one.initial) == (1.0, 2.0, {"c.x": 2.0, "c.k": 0.3})
+    np.testing.assert_array_equal(given(sigma=levels).sigma["c.x"], np.asarray(levels))
+    assert given(sigma=number(0.1)).sigma["c.x"] == 0.1 and Unknown(number(2.0)) == Unknown(2.0)
+    with pytest.raises(ModelError, match="'c.x' is known at 1, not at 2"):
         one.window(2.0, 3.0)
-    count: Any = np.int64(2)
-    assert Filter({"x": 1.0}, count) == Filter({"x": 1.0}, 2)
+    assert Filter({"c.x": 1.0}, count) == Filter({"c.x": 1.0}, 2)
