@@ -63,7 +63,9 @@ def steady_state(
     - `initial`: where the search starts, values by variables' names; default: the initial point. It decides which of
         several equilibria is found.
     - `drifting`: states whose derivatives need not vanish, such as the angle of a shaft at steady speed, and discrete
-        variables that need not settle, such as a counter. They keep their start values.
+        variables that need not settle, such as a counter. They keep their start values. Where a sum is conserved, such
+        as the fluid in connected tanks, equilibria are many: one state has to be named here, and its start value is the
+        one at rest.
     - `throw`: whether to raise an error if there is no such point. With False, its values and their derivatives are
         not-a-number. None: raise outside jit, grad and vmap only. Inside jit, True needs callbacks to the host, and
         JAX's persistent cache does not keep such programs.
@@ -84,7 +86,7 @@ def steady_state(
     """
     check_system(system)
     places = _places(system, drifting)
-    found, t, inputs = equilibrium_from(system, t, inputs, initial, places, throw)
+    found, t, inputs, _ = equilibrium_from(system, t, inputs, initial, places, throw)
     return point_of(system, found, t, inputs, drifting=places, singular_is_error=True, throw=throw)
 
 
@@ -95,8 +97,9 @@ def equilibrium_from(
     initial: Mapping[str, object] | None,
     drifting: Drifting,
     throw: bool | None,
-) -> tuple[Equilibrium, Array, dict[str, Array]]:
-    """The search from the initial point; the time and the inputs as arrays and as they were read."""
+) -> tuple[Equilibrium, Array, dict[str, Array], Array]:
+    """The search from the initial point; the time and the inputs as arrays and as they were read; the state array of
+    the initial point."""
     dtype = system.parameters.values.dtype
     initial = system.plan.one_by_one(initial)
     begin = find_initial(system, t, inputs, initial)
@@ -108,8 +111,8 @@ def equilibrium_from(
         found = compiled_search(*given, *drifting)
         # An input's function may close over a traced value, which shows in the outcome only.
         if not is_staged(found):
-            return found, t, inputs
-    return find_equilibrium(*given, *drifting), t, inputs
+            return found, t, inputs, begin.x
+    return find_equilibrium(*given, *drifting), t, inputs, begin.x
 
 
 def point_of(
@@ -174,12 +177,14 @@ def _not_found(system: AcausalSystem, found: Equilibrium, drifting: Drifting) ->
         return _restless(system, int(found.event))
     residual, limit = np.abs(np.asarray(found.residual)), np.asarray(found.limit)
     excess = residual / np.where(limit > 0, limit, np.finfo(limit.dtype).tiny)
+    # A row that is not a number is the first to be named.
     excess = np.where(np.isfinite(excess), excess, np.inf)
     rows = _row_names(system, drifting)
     worst = [k for k in np.argsort(-excess, kind="stable")[:WORST].tolist() if excess[k] > 1]
     left = "; ".join(f"{rows[k]} = {float(found.residual[k]):.3g}" for k in worst)
     text = f"no equilibrium was found; where the search ended, these are not zero: {left}."
     written = _written_names(system, drifting)
+    # Rows of clocks stand last, so that their places count from the end.
     counted = [written[k - len(rows)] for k in worst if k >= len(rows) - len(written)]
     if counted:
         return f"{text} If what a clock changes at each tick may go on, as a counter does, say drifting={counted}"
@@ -218,6 +223,16 @@ def _singular(system: AcausalSystem, found: Equilibrium, drifting: Drifting) -> 
     )
 
 
+def one_of_many(system: AcausalSystem, found: Equilibrium) -> str:
+    """Says that the linear model depends on which equilibrium is meant, where nothing determines some directions."""
+    drifting = Drifting()
+    loose, kept = _directions(_undetermined(system, found, drifting)), _enough(system, found, drifting)
+    return (
+        f"the equilibrium is one of many: nothing determines {loose}, and the linear model is another one at each. Say "
+        f"which is meant: at=steady_state(system, drifting={kept}) keeps the value at the start"
+    )
+
+
 def _directions(loose: list[list[str]]) -> str:
     texts = [f"'{names[0]}'" if len(names) == 1 else f"a common change of {some(names)}" for names in loose[:WORST]]
     return " and ".join(texts) + (" and others" if len(loose) > WORST else "")
@@ -237,6 +252,7 @@ def _undetermined(system: AcausalSystem, found: Equilibrium, drifting: Drifting)
     for direction in np.abs(np.asarray(directions)[np.asarray(is_open(values))]):
         inside = names[direction > IN_DIRECTION * direction.max()].tolist()
         loose.append(inside)
+    # Two directions of the same states are one finding for a reader.
     return [names for k, names in enumerate(loose) if names not in loose[:k]]
 
 
@@ -244,6 +260,7 @@ def _enough(system: AcausalSystem, found: Equilibrium, drifting: Drifting) -> st
     """States that may drift so that the others are determined: a mass that friction holds keeps its place and speed."""
     names, n_rows = _unknown_names(system, drifting), len(unknowns(system.plan, drifting.states))
     kept, left = list(range(len(names))), found
+    # One at a time: to hold a state also takes its row away, which may open another direction.
     while len(kept) and (loose := np.flatnonzero(np.asarray(is_open(open_directions(left)[0])))).size:
         direction = np.abs(np.asarray(open_directions(left)[1]))[loose[0]]
         del kept[int(np.argmax(direction > IN_DIRECTION * direction.max()))]

@@ -29,6 +29,19 @@ def finite(values: object, name: str, what: str) -> np.ndarray:
     return found
 
 
+def coefficients(values: object, name: str, what: str) -> np.ndarray:
+    """An array of numbers in one row; one number is a row, too.
+
+    **Raises:**
+
+    - `ModelError` if they are not, or if one of them is not finite.
+    """
+    found = np.atleast_1d(finite(values, name, what))
+    if found.ndim != 1:
+        raise ModelError(f"'{name}': {what} is one row of coefficients; got shape {found.shape}")
+    return found
+
+
 def increasing(values: object, name: str, what: str) -> np.ndarray:
     """An array of at least two increasing points.
 
@@ -40,6 +53,7 @@ def increasing(values: object, name: str, what: str) -> np.ndarray:
     if found.ndim != 1 or len(found) < 2:
         raise ModelError(f"'{name}': {what} needs a row of at least 2 points; got shape {found.shape}")
     if not (np.diff(found) > 0).all():
+        # The first False: where the order breaks.
         place = int(np.argmin(np.diff(found) > 0))
         twice = found[place + 1] == found[place]
         mend = "part the two points a little, or write a jump as a Piecewise or a Step" if twice else "sort it"

@@ -39,8 +39,21 @@ def _written_out(sources: Sources, of: Found, mark: Mark) -> Iterator[Change]:
             return
         places.append((side, at))
     entries = [text_of(with_entry(side, at, tree.Reference((_PLACE,)))) for side, at in places]
-    loop = f"for {_PLACE} in 1:{text_of(size_of(*places[0]))} loop connect({', '.join(entries)}); end for"
+    sizes = [_declared_size(sources, of, *place) for place in places]
+    size = next((s for s in sizes if s is not None), size_of(*places[0]))
+    loop = f"for {_PLACE} in 1:{text_of(size)} loop connect({', '.join(entries)}); end for"
     yield mark.begin, mark.end, loop
+
+
+def _declared_size(sources: Sources, of: Found, e: tree.Reference, at: int) -> tree.Expression | None:
+    """How many entries the declaration of an array of the class gives it, by parameters of the class: rumoca does not
+    evaluate the `size` of a connector of the class in the range of a loop."""
+    if at > 0:
+        return None
+    members = {d.name: d for d, _ in sources.declarations(of)}
+    size = members[e.parts[0]].dimensions[0] if e.parts[0] in members else tree.Whole()
+    known = all(not isinstance(x, tree.Reference) or x.path in members for x in tree.each_part(size))
+    return size if known and not isinstance(size, tree.Whole) else None
 
 
 def _is_boolean(kind: Found | None) -> bool:

@@ -12,14 +12,18 @@ from ..base.errors import ModelError, nearest
 from ..base.optional import optional_module
 from .readable_sources import with_readable_sources
 from .rumoca_expressions import Json
+from .sources import first_broken
 
 _PLACE = re.compile(r"× (?P<what>[^\n]*)\s+╭─\[[^\]]*?:(?P<line>\d+):(?P<column>\d+)\]")
 _UNRESOLVED = re.compile(r"unresolved (type reference|function call|component reference|[\w ]+): '([^']+)'")
 _UNBALANCED = re.compile(r"unbalanced model: (\d+) equations, (\d+) unknowns")
-_UNROOTED = re.compile(r"Connections\.branch\(([^,]+), [^)]+\) belongs to a virtual connection graph component with no")
+_UNROOTED = re.compile(
+    r"Connections\.branch\(([^,]+), ([^)]+)\) belongs to a virtual connection graph component with no"
+)
 _DECIDES = re.compile(
     r"not parameter-evaluable: unknown variable: ([\w.]+)|unresolved component dimension for [\w.]+: (\w+)"
 )
+_NOT_LOADED = re.compile(r"Failed to load source root")
 _CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")
 
 
@@ -58,8 +62,10 @@ class FrontEnd:
         self.session: Any = None
         self.readable: list[Path] = []
 
-    def flatten(self, text: str | None, model: str | None, file: Path | None = None) -> Flattened:
-        """Flattens a model of a text, of a file, or, if both are None, of the libraries.
+    def flatten(
+        self, text: str | None, model: str | None, file: Path | None = None, called: str | None = None
+    ) -> Flattened:
+        """Flattens a model of a text, of a file, or, if both are None, of the libraries. Messages name it `called`.
 
         **Raises:**
 
@@ -73,9 +79,13 @@ class FrontEnd:
                 found = session.loads(text, model=model)
             return Flattened(found.name, found.to_dict("dae"), found.to_dict("flat"))
         except (self.rumoca.RumocaError, RuntimeError) as error:
-            said = self._said(text or "", model, str(error))
+            said = self._said(text or "", model, str(error), called or model)
             if record := _UNROOTED.search(str(error)):
-                raise Unrooted(said, record[1]) from None
+                raise Unrooted(
+                    f"'{called or model}': nothing is the root of the graph of '{record[1]}' and '{record[2]}': "
+                    "open a part of a model that has the root (Connections.root) inside, as source=…",
+                    record[1],
+                ) from None
             if counts := _UNBALANCED.search(str(error)):
                 raise Unbalanced(said, int(counts[2]) - int(counts[1])) from None
             raise ModelError(said) from None
@@ -86,6 +96,7 @@ class FrontEnd:
 
     def _opened(self) -> Any:
         if self.session is None:
+            # rumoca asks for the folder that holds that of a library.
             folders = [root.parent if (root / "package.mo").exists() else root for root in self.roots]
             if any(f.is_dir() for f in folders):
                 copies = Path(tempfile.mkdtemp(prefix="modelica-"))
@@ -105,11 +116,17 @@ class FrontEnd:
         where = ", ".join(map(str, self.roots)) or "none is given"
         raise ModelError(f"'{name}' is in none of the roots: {where}; roots=[…] names the folder that holds '{first}'")
 
-    def _said(self, text: str, model: str | None, error: str) -> str:
+    def _said(self, text: str, model: str | None, error: str, called: str | None) -> str:
         """What rumoca found wrong, with its place."""
+        if _NOT_LOADED.search(error) and (broken := first_broken(self.roots)):
+            return broken
+        error = error.partition("\nRelated failures")[0]
+        error = re.sub(rf"\b{re.escape(model)}\b(?! =)", called, error) if model and called else error
+        # A syntax error has a place in the text, which the error of the flattening does not say.
         wrong = [d.message for d in self.rumoca.validate_source(text, model=model) if d.rule == "syntax-error"]
         if place := _PLACE.search("\n".join(wrong)):
             return f"Modelica, line {place['line']}, column {place['column']}: {place['what'].strip()}"
+        # A type that is not found explains other names that are not: it is said first.
         unresolved = sorted(
             (m.groups() for m in _UNRESOLVED.finditer(error)), key=lambda each: each[0] != "type reference"
         )
@@ -127,7 +144,7 @@ class FrontEnd:
             equations, unknowns = map(int, counts.groups())
             which = "are too many" if equations > unknowns else "lack one"
             counts = f"{_count(equations, 'equation')} for {_count(unknowns, 'unknown')}"
-            return f"'{model or last}' has {counts}; rumoca does not say which of them {which}"
+            return f"'{called or last}' has {counts}; rumoca does not say which of them {which}"
         if found := _DECIDES.search(error):
             name = found[1] or found[2]
             return f"the class gives no value to '{name}', which decides its equations: component(…, {name}=…)"

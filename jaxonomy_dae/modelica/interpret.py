@@ -14,7 +14,7 @@ from . import tree
 from .builtin import FUNCTIONS, applied, filled
 from .definitions import assigned_in
 from .evaluate import Evaluator, Names, index_of, local_names, with_end
-from .loops import JUMPS, at, carried, placed, repeated
+from .loops import JUMPS, MOST, at, carried, placed, repeated
 from .values import Record, Results, Value, as_number, both, chosen, either, is_condition, negated
 
 MOST_ROUNDS = 100_000  # of a loop that is carried out while the model is read
@@ -216,6 +216,7 @@ class Interpreter(Evaluator):
                 return
             rest = s._replace(branches=s.branches[k + 1 :])
             results = []
+            # The branches that remain are an `if` of their own, so that only two are joined at a time.
             for condition, statements in ((holds, body), (negated(holds), (rest,))):
                 copied = dict(local)
                 self.guards.append(condition)
@@ -230,22 +231,23 @@ class Interpreter(Evaluator):
         if s.condition is None:
             self._rounds(s.iterators, s.body, local, names)
         else:
-            self._while(s.condition, s.body, local, names)
+            self._while(s, s.condition, local, names)
         local["break"] = outer
 
-    def _while(self, condition: tree.Expression, body: tuple, local: dict[str, Value], names: Names) -> None:
+    def _while(self, s: tree.Loop, condition: tree.Expression, local: dict[str, Value], names: Names) -> None:
         for _ in range(MOST_ROUNDS):
             holds = both(self.evaluate(condition, names), negated(either(*(local.get(j, False) for j in JUMPS))))
             if not isinstance(holds, bool):
-                self._repeated(condition, body, local, names)
+                self._repeated(s, condition, local, names)
                 return
             if not holds:
                 return
-            self.execute(body, local, names)
+            self.execute(s.body, local, names)
         raise ModelError(f"a while loop takes more than {MOST_ROUNDS} rounds")
 
-    def _repeated(self, condition: tree.Expression, body: tuple, local: dict[str, Value], names: Names) -> None:
+    def _repeated(self, s: tree.Loop, condition: tree.Expression, local: dict[str, Value], names: Names) -> None:
         """A loop of which it is not known how often it is carried out."""
+        body = s.body
         written = [e for e in tree.each_part(body) if isinstance(e, tree.Jump)]
         changed = [name.partition("[")[0].partition(".")[0] for name in assigned_in(body)]
         for jump in {e.kind for e in written}:
@@ -254,6 +256,7 @@ class Interpreter(Evaluator):
         state = carried(list(dict.fromkeys(changed)), local)
         inside = dict(local)
         placed([(c.path, c.value) for c in state if c.before is not None], inside)
+        # Names would be equations of the model, outside of the loop, where what a round reads has no value.
         named, guards, self.named, self.guards = self.named, self.guards, lambda e: e, []
         try:
             within = local_names(inside, names)
@@ -266,12 +269,13 @@ class Interpreter(Evaluator):
         state = [c._replace(is_truth=c.is_truth or is_condition(v)) for c, v in zip(state, after, strict=True)]
         function, others = repeated(goes_on, state, after)
         before = [0.0 if c.before is None else as_number(c.before) for c in state]
-        found = self.opaque(function, [*others, *before], len(state))
-        ends = [sympy.Eq(s, 1) if c.is_truth else s for c, s in zip(state, found, strict=True)]
+        found = self.opaque(function, [*others, *before], len(state), f"while on line {s.line} within {MOST} rounds")
+        ends = [sympy.Eq(e, 1) if c.is_truth else e for c, e in zip(state, found, strict=True)]
         placed([(c.path, v) for c, v in zip(state, ends, strict=True)], local)
 
     def _rounds(self, iterators: tuple, body: tuple, local: dict[str, Value], names: Names) -> None:
         (name, over), *rest = iterators
+        # The iterator of a loop hides a variable of its name, which is as it was afterwards.
         was_there, shadowed = name in local, local.get(name)
         for value in self._range_of(over, names):
             if local.get("return") is True or local.get("break") is True:

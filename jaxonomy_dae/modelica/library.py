@@ -7,13 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import ModelError, nearest
+from .balance import balance
 from .boundaries import flattened
-from .front_end import FrontEnd
+from .front_end import FrontEnd, Unbalanced
 from .modification import modification
 from .open_class import OpenClass, opened
 from .open_component import OpenComponent
+from .read_base import Reader
 from .shelf import Shelf
 from .sources import Found, Sources
+from .tree import Declaration
 
 
 class Library:
@@ -62,7 +65,7 @@ class Library:
         key = name, changes, source or ""
         if key not in self._classes:
             found = self.opened(name, changes, source)
-            _check_modified(found, modifications)
+            _check_modified(found, {**_named_in(texts), **modifications})
             self._classes[key] = component_of(found)
         return self._classes[key]
 
@@ -82,12 +85,25 @@ class Library:
                     f"'{name}' is packed without the modifications '{changes}': roots=[…] with the sources of the "
                     "library opens it with them"
                 )
+            if not self.shelf.packs:
+                raise ModelError(f"'{name}': roots=[…] names the folder of its library, or source= holds its text")
             raise ModelError(f"there is no class '{name}' in {self.shelf}: {nearest(name, packed)}")
         if source is None:
             self._check_known(name)
-        return opened(
-            name, flattened(self.front_end, name, changes, source, functools.partial(self._records, name, source))
-        )
+        # Records are read from the sources only if the front end misses equations: it takes a search through files.
+        try:
+            return opened(
+                name, flattened(self.front_end, name, changes, source, functools.partial(self._records, name, source))
+            )
+        except Unbalanced as error:
+            found = self._names.find(name) if source is None else None
+            if not isinstance(found, Found):
+                raise
+            raise ModelError(f"{error}. {balance(self._names, found)}") from None
+        except ModelError:
+            if source is None:
+                self._names.find(name)  # says where its file is not Modelica, if that is the reason
+            raise
 
     def _records(self, name: str, source: str | None) -> list[str]:
         """The overdetermined records of the connectors of a class of the library."""
@@ -114,9 +130,12 @@ class Library:
         """Names what is near a class that no root holds, before the front end reads the whole library."""
         sources = self._names
         try:
-            if isinstance(sources.find(name), Found):
-                return
+            known = sources.find(name)
         except ModelError:  # a file that only the front end reads
+            return
+        if isinstance(known, Found):
+            if known.source.kind in ("package", "connector", "function", "record", "type"):
+                raise ModelError(f"'{name}' is a {known.source.kind}: only models and blocks are components")
             return
         package, _, last = name.rpartition(".")
         while package:
@@ -126,6 +145,12 @@ class Library:
             package, _, last = package.rpartition(".")
         where = ", ".join(map(str, self.sources))
         raise ModelError(f"'{name}' is in none of the roots: {where}; roots=[…] names the folder that holds '{last}'")
+
+
+def _named_in(texts: Sequence[str]) -> dict[str, None]:
+    """The components that texts modify; redeclared classes are none."""
+    modifiers = Reader(f"({', '.join(texts)})").modifiers()
+    return {name: None for name, value in modifiers.items() if not isinstance(value, Declaration)}
 
 
 def _check_modified(of: OpenClass, modifications: Mapping[str, Any], outer: str = "") -> None:

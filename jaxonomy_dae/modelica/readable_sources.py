@@ -22,7 +22,7 @@ from .complex_sources import with_real_equations
 from .kept_files import contents, write
 from .sources import Sources
 
-_FORMAT = 2  # to be raised with every change of what is changed in sources
+_FORMAT = 3  # to be raised with every change of what is changed in sources
 _LOOK_UP = "getTable1DValue"
 # parameter Type name(modifiers) = binding "comment";
 _BOUND = re.compile(
@@ -52,6 +52,7 @@ def _kept(root: Path, sources: Sources) -> dict[str, str]:
     folder = folder_of("modelica")
     if folder is None:
         return dict(_changed(root, sources))
+    # All roots count, since types of a file may be defined in another library.
     told = json.dumps([_FORMAT, [contents(r, folder) for r in sources.roots], str(root)])
     path = folder / "readable" / f"{hashlib.sha256(told.encode()).hexdigest()}.gz"
     with contextlib.suppress(OSError, EOFError, ValueError):

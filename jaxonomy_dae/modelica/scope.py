@@ -26,7 +26,7 @@ from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
-from .tree import Assignment, Class, Declaration, Equality, Expression, Reference, Truth, entry_name
+from .tree import Assignment, Call, Class, Declaration, Equality, Expression, Reference, Truth, each_part, entry_name
 from .values import Record, Value, as_number, both, is_condition, negated, plain
 from .written_out import entries_of, unrolled
 
@@ -79,6 +79,7 @@ class Scope:
         self.kept = self.discrete.kept
         self.as_numbers = False
         self.final: dict[str, Value] = {}
+        # Only now: sizes may depend on parameters, records and functions, which the interpreter finds by their names.
         self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
         self.declared = {d.name: d for d in flat.model.declarations}
         entries, fields = _gather(self.declared)
@@ -239,6 +240,8 @@ class Scope:
             raise ModelError(f"line {d.line}: nothing determines '{d.name}': it has neither an equation nor a when")
         if found is None:  # an input of the model that nothing drives
             start = self._start(d.modifiers.get("start")) or self._least(d.type)
+            if isinstance(start, sympy.Expr):
+                raise ModelError(f"line {d.line}: the start of '{d.name}', an input that nothing drives, is a number")
             return bool(start) if self.kind(d.type) == "Boolean" else int(start)
         return self.defined(d.name, found)
 
@@ -292,6 +295,7 @@ class Scope:
                 if isinstance(s.left, Reference) and s.left.path == name and not any(s.left.subscripts):
                     try:
                         return self.interpreter.evaluate(s.right, self._at_start)
+                    # Such as one that depends on itself through another parameter: then both are found by solving.
                     except ModelError:
                         return None
         return None
@@ -327,6 +331,7 @@ class Scope:
             )
         nominal = self._start(d.modifiers.get("nominal"))
         start = self._start(d.modifiers.get("start"))
+        # An input of a part is bound to what drives it, and is an ordinary variable.
         if "input" in d.prefixes and d.value is None:
             return self.component.input(d.name, default=None if start is None else float(start), unit=self._unit(d))
         fixed = d.modifiers.get("fixed") == Truth(True)
@@ -336,6 +341,7 @@ class Scope:
             self.definitions.equations.append(Equality(Reference((d.name,)), d.value, d.line))
         return self.component.variable(
             d.name, start=start, fixed=fixed, unit=self._unit(d),
+            # A nominal value of zero, or in parameters, says nothing of a size that is known now.
             nominal=abs(nominal) if isinstance(nominal, int | float) and nominal else None,
         )  # fmt: skip
 
@@ -362,7 +368,7 @@ class Scope:
             self.component.add_equations(sympy.Eq(self.names[e], self.kept.in_equations(e), evaluate=False))
         return self.names[e]
 
-    def _opaque(self, function: Callable, arguments: Sequence[Value], count: int) -> Sequence[Value]:
+    def _opaque(self, function: Callable, arguments: Sequence[Value], count: int, called: str) -> Sequence[Value]:
         """The results of a function of JAX, as variables; its arguments are variables, too."""
         c = self.component
         inputs: list[sympy.Symbol] = []
@@ -372,7 +378,7 @@ class Scope:
                 c.add_equations(sympy.Eq(symbol, value, evaluate=False))
                 value = symbol
             inputs.append(value)
-        return c.function(f":loop[{len(c.learned_terms)}]", function, inputs, count)
+        return c.function(f":{called}[{len(c.learned_terms)}]", function, inputs, count)
 
     def _root(self, *arguments: Value) -> Value:
         return root(self.component, self.interpreter.guards, *arguments)
@@ -391,14 +397,31 @@ class Scope:
         outside = table.outside(u) if isinstance(u, sympy.Expr) else False
         outside = functools.reduce(both, self.interpreter.guards, outside)
         if not isinstance(outside, bool) and outside not in self.ends and outside.atoms(VariableSymbol, TimeSymbol):
+            # One event for each condition, however many columns of a table are read.
             self.ends.add(outside)
             first, last = table.rows[0, 0] + table.shift, table.rows[-1, 0] + table.shift
-            told = f"a table is read outside of [{first:g}, {last:g}], without extrapolation"
+            inside = ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in (first, last))
+            told = f"a table is read outside of [{inside}], without extrapolation"
             self.component.when(self.kept.in_discrete(outside), terminate(told), at_start=True)
         return read(table, column, u, *more)
 
     def _pre(self, e: Expression) -> Value:
-        return previous(self.evaluate(e))
+        value = self.evaluate(e)
+        for s in _variables(value):
+            # A state jumps by `reinit` alone, at the end of an iteration: until then it is what it was before.
+            if not s.path.startswith(":") and s.path not in self.states:
+                raise ModelError(
+                    f"pre({s.path}): '{s.path}' is neither discrete nor a state, and may jump with others at the "
+                    f"instant: what it was before is not kept. Write pre(…) of what its equation reads"
+                )
+        return previous(value)
+
+    @functools.cached_property
+    def states(self) -> set[str]:
+        """The variables of which equations read the derivative."""
+        parts = each_part((self.flat.model.equations, self.flat.model.algorithms))
+        calls = (p for p in parts if isinstance(p, Call) and p.function == "der")
+        return {s.path for c in calls for s in _variables(self.evaluate(c.arguments[0]))}
 
     def _edge(self, e: Expression) -> Value:
         now = self.evaluate(e)
@@ -417,6 +440,16 @@ class Scope:
 
 def _is_of_parameters(value: sympy.Expr) -> bool:
     return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols_of(value))
+
+
+def _variables(value: Value) -> list[VariableSymbol]:
+    """The continuous variables in a value."""
+    if isinstance(value, list):
+        return [s for v in value for s in _variables(v)]
+    if isinstance(value, Record):
+        return [s for v in value.values() for s in _variables(v)]
+    found = symbols_of(value) if isinstance(value, sympy.Basic) else ()
+    return [s for s in found if isinstance(s, VariableSymbol)]
 
 
 T = TypeVar("T")

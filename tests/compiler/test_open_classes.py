@@ -99,6 +99,8 @@ def test_modifications_decide_the_equations(library):
     assert [load.parameters[f"phase[{k}].alpha"].value for k in (1, 2, 3)] == [0.1, 0.2, 0.3]
     with pytest.raises(ModelError, match=r"'Devices.Resistor' has no 'usePort' to modify: did you mean 'useHeatPort'"):
         library.component("Devices.Resistor", usePort=True)
+    with pytest.raises(ModelError, match=r"'Devices.Resistor' has no 'usePort' to modify: did you mean 'useHeatPort'"):
+        library.component("Devices.Resistor", "usePort = true")
     with pytest.raises(ModelError, match=r"the modification 'G' is a number, a truth"):
         library.component("Devices.Conductor", G=object())
 
@@ -124,7 +126,8 @@ def test_a_network_of_open_classes_and_own_parts_is_square(library):
 @pytest.mark.parametrize(
     "name, told",
     [
-        ("Devices.Open", r"'Devices.Open' has 2 equations for 3 unknowns; .* lack one"),
+        ("Devices.Open", r"'Devices.Open' has 2 .* for 3 unknowns; .* lack one. Variables: p, x.*names x$"),
+        ("Devices", r"'Devices' is a package: only models and blocks are components"),
         ("Devices.OnePort", r"'Devices.OnePort' is partial: open a class that extends it"),
         ("Devices.Resistorr", r"'Devices' has no class 'Resistorr': did you mean 'Resistor'"),
         ("Device.Resistor", r"'Device.Resistor' is in none of the roots: .*Devices.mo; roots="),
@@ -380,20 +383,27 @@ def test_connections_of_arrays_of_boolean_connectors_are_loops(tmp_path):
   model Switch
     Signal on;
   end Switch;
+  model Group
+    Signal on[2];
+  end Group;
   model Switches
     parameter Integer m = 3;
     Signal on[m];
     Switch switch[m];
+    Group group, other;
   equation
     connect(on, switch.on);
     connect(on[1], switch[1].on);
+    connect(group.on, other.on);
   end Switches;
 end Bank;
 """
     (tmp_path / "Bank.mo").write_text(source)
     new = with_single_connections(Sources([tmp_path]), source)
-    loop = "for k__ in 1:size(on, 1) loop connect(on[k__], switch[k__].on); end for;"
-    assert new == source.replace("connect(on, switch.on);", loop)
+    loop = "for k__ in 1:m loop connect(on[k__], switch[k__].on); end for;"
+    other = "for k__ in 1:size(group.on, 1) loop connect(group.on[k__], other.on[k__]); end for;"
+    expected = source.replace("connect(on, switch.on);", loop).replace("connect(group.on, other.on);", other)
+    assert new == expected
 
 
 def test_a_size_without_a_value_is_asked_for():

@@ -84,6 +84,7 @@ def gathered(
     by_base = {}
     first = equation_offsets(groups)
     for group in extended.groups:
+        # At level zero stand the equations as written.
         if group.level == 0:
             g = int(np.searchsorted(first, group.base[0], side="right") - 1)
             by_base[g] = group
@@ -99,6 +100,12 @@ def values_and_errors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The numbers of all entries at a point, and bounds of their errors, from those of all quantities, (quantities +
     1,)."""
+    found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def both(group: ExtendedGroup) -> tuple[np.ndarray, np.ndarray]:
+        if id(group) not in found:
+            found[id(group)] = group.partials_with_errors(at, known)
+        return found[id(group)]
+
     where = groups, extended, entries
-    errors = gathered(*where, lambda group: group.partial_errors(at, known))
-    return gathered(*where, lambda group: group.partials(at)), errors
+    return gathered(*where, lambda group: both(group)[0]), gathered(*where, lambda group: both(group)[1])

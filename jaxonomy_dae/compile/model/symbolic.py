@@ -151,10 +151,11 @@ class SymbolicTemplate(AbstractTemplate):
     def _partials_with_errors(self) -> KernelWithErrors:
         return KernelWithErrors(self.partials, self._labels)
 
-    def partial_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple:
+    def partials_with_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple[tuple, tuple]:
         given = [*parameters, *coefficients, t]
         known = [KNOWN * np.abs(v) for v in given]
-        return tuple(self._partials_with_errors([*slots, *given], [*errors, *known])[1])
+        found, bounds = self._partials_with_errors([*slots, *given], [*errors, *known])
+        return tuple(found), tuple(bounds)
 
     @functools.cached_property
     def _terms(self) -> Sequence[Node]:
@@ -189,6 +190,7 @@ class SymbolicTemplate(AbstractTemplate):
     def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Numeric:
         def solved() -> list[Node]:
             rest = substitute(self.graph, {slot_label(self.slots[position]): constant(0)})
+            # Affine in the slot, F is zero at −F(0)/(∂F/∂slot).
             return [scale(-1, divide(rest, self.partials[position]))]
 
         return self._evaluate(("solve", position), solved, (slots, parameters, coefficients, t), backend)[0]
