@@ -260,6 +260,10 @@ BAD = {
     ),
     "names": (lambda: solve_dae(TERM, 1.0, GOOD, names=["p"]), "names must name every unknown: 3 of them; got 1"),
     "negative rtol": (lambda: solve_dae(TERM, 1.0, GOOD, rtol=-1.0), "rtol must be a number ≥ 0; got -1.0"),
+    "complex": (
+        lambda: solve_dae(DAETerm(minus, mass=np.ones(1)), 1.0, np.array([1j])),
+        "y0 must be real: make the real and the imaginary parts unknowns of their own",
+    ),
     "rtol of each": (
         lambda: solve_dae(TERM, 1.0, GOOD, rtol=np.array([0.1, 0.1])),
         "rtol must be one number; got [0.1 0.1]. Where unknowns differ, give atol in the shape of y",
