@@ -424,7 +424,7 @@ def _seconds(column: Any) -> np.ndarray:
         try:
             stamps = np.array([np.datetime64(_without_zone(v), "us") for v in column])
         except (TypeError, ValueError) as error:
-            raise ModelError(f"times must be numbers or dates; got {column[0]!r}") from error
+            raise ModelError(f"times must be numbers or dates; got {next(iter(column))!r}") from error
         return (stamps - stamps[0]) / np.timedelta64(1, "s")
     return values.astype(float)
 

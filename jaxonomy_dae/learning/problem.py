@@ -262,6 +262,8 @@ class Problem:
         if self.method not in METHODS:
             stacked.check_plain(f"method={type(self.method).__name__}")
         check_steps(stacked)
+        if not stacked.observed[~stacked.holdout & (stacked.weight > 0)].any():
+            raise ModelError("nothing is to be fitted: what has samples is held out, or has the weight 0")
         return Objective(
             self.system, self.observers, self.layout_of(stacked), 1.0, stacked, c,
             penalties=self.penalties if penalties is None else penalties, counted=~stacked.holdout,
