@@ -225,8 +225,8 @@ def _check_shared(outputs: Iterable[str], noises: Mapping[str, Noise]) -> None:
         shared = noises[name].shared
         if shared in noises and noises[shared].shared != shared:
             raise ModelError(
-                f"the noise of '{name}' shares the level '{shared}', which is the name of an output that does not: give "
-                "it another name, or that output the same Noise(shared=…)"
+                f"the noise of '{name}' shares the level '{shared}', which is the name of an output that does not: "
+                "give it another name, or that output the same Noise(shared=…)"
             )
 
 
