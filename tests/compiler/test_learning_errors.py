@@ -106,6 +106,7 @@ def test_experiment(given, words):
             "'held' in experiment 0 and 'linear' in experiment 1",
         ),
         ([record(holdout=True)], {}, "every experiment is held out"),
+        ([record(weight=0.0)], dict(method=Filter({"tank.level": 0.1})), "nothing is to be fitted"),
         (
             [record({"tank.level": TIMES, "tank.outflow": TIMES}, sigma={"tank.level": Noise(shared="tank.outflow")})],
             {},
