@@ -24,6 +24,7 @@ from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .identifiability import Identifiability, identifiability, natural_scale, spreads
 from .intervals import checked_level, intervals, noise_intervals, profile
+from .law_process import LawProcess
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
 from .program import with_values
@@ -328,6 +329,10 @@ class Estimate:
     ) -> Band:
         """A learned law over a grid, with its spread and the explored region.
 
+        Of a raw `equinox.nn.MLP` whose prior the evidence chooses, two models of the law are weighted by their
+        evidence: the network's weights, linearized, and a Gaussian process, which allows for kinks that no weight sets.
+        The first call for a law compiles a program. Of other networks, the spread is that of the weights.
+
         **Arguments:**
 
         - `name`: the name of a trained network or sensor law.
@@ -374,6 +379,17 @@ class Estimate:
             return self.objective, self.point, self.root, experiment
         new = Unseen.of(self, experiment, first)
         return new.objective, new.point, new.root, 0
+
+    def law_process(self, name: str) -> LawProcess | None:
+        """A learned law as a Gaussian process, with the probability that it is the better model of it; None of networks
+        that promise more than to be functions."""
+        if name not in self._processes:
+            self._processes[name] = LawProcess.of(self, name)
+        return self._processes[name]
+
+    @functools.cached_property
+    def _processes(self) -> dict[str, LawProcess | None]:
+        return {}
 
     def explored(self, name: str, along: str | Callable[[Any], Any] | None = None) -> Float[np.ndarray, "inputs 2"]:
         """The range of values that the experiments contain, of each input of a learned law, or of the quantity
