@@ -1,5 +1,8 @@
 """What experiments and problems refuse, and with which words. Nothing is simulated."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,6 +24,7 @@ from jaxonomy_dae.learning import (
     Shooting,
     Unknown,
 )
+from jaxonomy_dae.learning.band import law_of
 from jaxonomy_dae.learning.evaluation import Evaluation
 from jaxonomy_dae.learning.intervals import checked_level
 from jaxonomy_dae.learning.table import Row, Table
@@ -341,3 +345,14 @@ def test_the_prior_of_a_positive_number_of_an_experiment_is_normal():
     z = objective.coordinates.scaled(np.array([4.0]))
     found = Evaluation(np.zeros(3), np.zeros((3, 1)))
     assert objective.weights(z, found).prior(z).residual == pytest.approx([(4.0 - 1.0) / 2.0], rel=1e-12)
+
+
+def test_grids_of_bands(system):
+    """Bare errors of array shapes."""
+    fit: Any = SimpleNamespace(
+        objective=SimpleNamespace(layout=SimpleNamespace(modules=("tank.loss",))), system=system, observers={}
+    )
+    with pytest.raises(ModelError, match=r"'tank.loss' has 1 inputs, tank.level: .* shape \(n, 1\); got \(4, 2\)"):
+        law_of(fit, "tank.loss", np.ones((4, 2)), None)
+    with pytest.raises(ModelError, match="got one number, 0.5"):
+        law_of(fit, "tank.loss", 0.5, None)
