@@ -50,7 +50,7 @@ class OpenComponent(FlatComponent):
         given = _given(of, parameters, where)
         missing = [n for n in of.required if n not in given]
         if missing:
-            least = ", ".join(f"{n}=…" for n in missing)
+            least = ", ".join(f"{n}=…" if n.isidentifier() else f'**{{"{n}": …}}' for n in missing)
             raise ModelError(
                 f"{where}: the class gives no value to {_listed(missing)}: {type(self).__name__}(…, {least})"
             )

@@ -436,12 +436,14 @@ class Reader:
             name = self.name()
             dimensions = self._subscripts() + shared
             modifiers, value = self.modifiers(), self._value()
+            whether: frozenset[str] = frozenset()
             if self.take("if"):
                 self.expression()
+                whether = frozenset({"conditional"})
             self.pass_constraint()
             comment = self.comment()
             self.pass_annotation()
-            yield tree.Declaration(prefixes, kind, name, dimensions, modifiers, value, comment, line)
+            yield tree.Declaration(prefixes | whether, kind, name, dimensions, modifiers, value, comment, line)
         self.need(";")
 
     def file(self) -> tree.Class:
