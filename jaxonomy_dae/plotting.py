@@ -18,6 +18,7 @@ TICK = 0.04  # of the height of the axes
 ROUNDING = 1e-6  # of the time that is drawn
 
 
+# `analysis.response` draws by this module: a protocol in place of its class keeps imports one way.
 @runtime_checkable
 class Response(Protocol):
     """A `FrequencyResponse`, as its figures read it: by pairs (output, input)."""
@@ -54,6 +55,7 @@ def plot_solution(solution: ByName, *names: str, ax: Axes | None = None, events:
 
     **Returns:** the Matplotlib axes; an array of them if there are several panels.
     """
+    # A solution that saved some variables only has not all states.
     names = names or tuple(n for n in solution.system.states if n in solution)
     if not names:
         raise ModelError("nothing to plot: the system has no states; name some variables")
@@ -62,6 +64,7 @@ def plot_solution(solution: ByName, *names: str, ax: Axes | None = None, events:
     unit_of |= dict(zip(flat.parameters.names, flat.parameters.units, strict=True))
     lines = [one for name in names for one in _lines(solution, name)]
     units = [unit_of.get(_entries(solution, name)[0]) or "" for name in lines]
+    # In the order of the names, which the reader chose.
     panels = list(dict.fromkeys(units))
     if ax is not None or len(panels) == 1:
         axes = new_axes(ax)
@@ -90,6 +93,7 @@ def _panel(solution: ByName, names: list[str], units: list[str], ax: Axes, event
             continue
         rest = values.reshape(len(time), -1)
         line = ax.plot(time, rest[:, 0], label=label, linewidth=0.8, drawstyle=style)[0]
+        # One colour and one entry of the legend for an array: a thousand cells have no names worth reading.
         ax.plot(time, rest[:, 1:], color=line.get_color(), linewidth=0.8, alpha=0.5, drawstyle=style)
     marked = _mark_events(solution, ax) if events else False
     ax.set_xlabel("Time / s")
@@ -131,6 +135,7 @@ def _steps(solution: ByName, name: str) -> tuple[np.ndarray, np.ndarray]:
 def _seen(solution: ByName) -> np.ndarray:
     """True for the noted events that lie within the saved times, shape (events,)."""
     ts, time = np.asarray(solution.events.ts), np.asarray(solution.ts)
+    # Rows that a run did not reach are infinite.
     time = time[np.isfinite(time)]
     if not time.size:
         return np.zeros(len(ts), bool)
@@ -148,16 +153,19 @@ def _mark_events(solution: ByName, ax: Axes) -> bool:
     names = [solution.events.all_names[int(k)] for k in np.asarray(log.which)[chosen]]
     groups = {name: ts[[one == name for one in names]] for name in dict.fromkeys(names)}
     if len(groups) > 1 and (len(ts) > LINES or len(groups) > len(DASHES)):
+        # More names than dashes that can be told apart: one kind of mark for all.
         groups = {"events": ts}
     collections = optional_module("matplotlib.collections", "plot", "plotting needs Matplotlib")
     labelled = ax.get_legend_handles_labels()[1]
     height = 1.0 if len(ts) <= LINES else TICK
     for (name, at), dash in zip(groups.items(), DASHES, strict=False):
         marks = collections.LineCollection(
+            # One collection, not a line for each: thousands of bounces draw at once.
             [[(t, 0.0), (t, height)] for t in at], transform=ax.get_xaxis_transform(), zorder=1, colors="0.45",
             linewidths=0.8, linestyles=[dash if height == 1.0 else "solid"],
             label="_" * (name in labelled) + name,  # a legend leaves out what begins with "_"
         )  # fmt: skip
+        # Marks do not stretch the axes: their height is that of the axes.
         ax.add_collection(marks, autolim=False)
     return bool(groups)
 
@@ -215,6 +223,7 @@ def structure(system: AcausalSystem, ax: Axes | None = None) -> Axes:
     is_torn = np.isin(column, np.concatenate(torn)) if torn else np.zeros(len(column), bool)
     side = float(np.clip(0.22 * n + 2.0, 3.5, 9.0))
     ax = new_axes(ax, side, side)
+    # In points², as `scatter` has it: dots fill about the same part of a cell at any size.
     dot = float(np.clip(2000.0 / n**2, 0.5, 40.0))
     ax.scatter(column[~is_torn], row[~is_torn], s=dot, color="C0", linewidths=0)
     ax.scatter(column[is_torn], row[is_torn], s=dot, color="C3", linewidths=0)
@@ -224,6 +233,7 @@ def structure(system: AcausalSystem, ax: Axes | None = None) -> Axes:
             corner, side = (first - 0.5, first - 0.5), last - first
             ax.add_patch(pyplot().Rectangle(corner, side, side, fill=False, color="0.4", linewidth=0.8))
     ax.set_xlim(-0.5, n - 0.5)
+    # The first equation is at the top, as matrices are written.
     ax.set_ylim(n - 0.5, -0.5)
     ax.set_aspect("equal")
     if n <= NAMED:
@@ -251,13 +261,17 @@ def bode(response: Response, *pairs: tuple[str, str], axes: Any = None) -> Any:
     elif np.shape(axes) != (2,):
         raise ModelError(f"a Bode plot needs two axes, for magnitude and phase; got shape {np.shape(axes)}")
     upper, lower = axes
+    # Phases are unwrapped from neighbour to neighbour, so frequencies must ascend.
     order = np.argsort(np.asarray(response.omega))
     omega = np.asarray(response.omega)[order]
     for pair in pairs:
         values = np.asarray(response[pair])[order]
         with np.errstate(divide="ignore"):  # −∞ dB, a gap in the line
             upper.semilogx(omega, 20.0 * np.log10(np.abs(values)), label=_arrow(pair), linewidth=1.6)
-        lower.semilogx(omega, np.degrees(np.unwrap(np.angle(values))), label=_arrow(pair), linewidth=1.6)
+        phase = np.angle(values)
+        known = np.isfinite(phase)  # not at a pole on the axis, over which phases are unwrapped all the same
+        phase[known] = np.unwrap(phase[known])
+        lower.semilogx(omega, np.degrees(phase), label=_arrow(pair), linewidth=1.6)
     upper.set_ylabel("Magnitude / dB")
     lower.set_ylabel("Phase / °")
     lower.set_xlabel("Angular frequency / (rad/s)")

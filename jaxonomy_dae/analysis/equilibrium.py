@@ -80,6 +80,7 @@ class _Rows:
         q0 = self.still[0].discrete_values.astype(x0.dtype)
         self.begin = Point(x0, q0, jnp.full(q0.shape, -1), jnp.zeros(q0.shape, bool))
         self.k = len(self.free) + len(self.solved_for)
+        # Rows are counted by tracing them: which there are depends on events, constraints and branches.
         self.m = jax.eval_shape(lambda: self.residual(self.start(self.begin), self.begin, *self.still)).shape[0]
 
     def start(self, base: Point) -> Array:
@@ -98,6 +99,7 @@ class _Rows:
         here = system.holding(q).at(t, inputs)
         slopes = here.semi_explicit(x)
         now = jax.lax.stop_gradient(slopes)
+        # Its value is taken away and not its derivative, so that the Jacobian still sees how it creeps.
         slopes = slopes - jnp.where(jnp.abs(now) <= self.slowest, now, 0)  # what creeps is at rest
         rows = [slopes[self.free], here.projected_onto(x)]
         if self.events is not None and len(self.events.ticking):
@@ -130,6 +132,7 @@ class _Rows:
         """The equilibrium of the equations with the modes of a point."""
         start, dtype = self.start(base), base.x.dtype
         if not self.k:
+            # Without unknowns there is nothing to search: an event or a clock alone decides whether the system rests.
             rest = self.residual(start, base, *self.still)
             none = jnp.zeros((self.m, 0), dtype)
             return base, Root(start, none, jnp.zeros_like(rest), start, jnp.all(rest == 0))
@@ -153,6 +156,7 @@ class _Rows:
             parts = found.x, found.jacobian, found.limit, found.unit, found.method < FAILED
             return Root(*map(jnp.asarray, parts))
 
+        # Steps in time need a square system: one row for each unknown.
         if self.events is None or self.m > self.k:
             root = root_from(start)
         else:  # relations may hold slopes constant, and no step of a search for a root leads on
@@ -160,6 +164,7 @@ class _Rows:
 
             def again(carry: tuple[Array, Root]) -> tuple[Array, Root]:
                 count, _ = carry
+                # Only where the first search has failed, since a path in time costs up to 200 Jacobians.
                 led = jax.lax.cond(count == 0, lambda: start, lambda: pseudo_transient(function, mass, start, typical))
                 return count + 1, root_from(led)
 
@@ -175,6 +180,7 @@ class _Rows:
             return root.w, self.followed(root.w, base, *self.given)
         matrix = root.jacobian
         if self.events is not None and len(self.events.computed):
+            # The search has held what events compute. Derivatives follow it, and so need another Jacobian.
             matrix = jax.lax.stop_gradient(jax.jacfwd(lambda w: self.followed(w, base, *self.still))(root.w))
         # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
         idle = jnp.asarray(np.eye(self.m, self.k), matrix.dtype)
@@ -184,6 +190,7 @@ class _Rows:
             remaining = self.followed(w, base, *self.given)
             return w - root.unit * least_squares(matrix, jnp.where(root.good, remaining, 0)), remaining
 
+        # One step carries first derivatives, the second one second derivatives.
         w, remaining = jax.lax.scan(correct, root.w, length=2)
         return w, remaining[-1]
 

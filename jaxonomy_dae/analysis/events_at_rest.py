@@ -72,6 +72,7 @@ def resting_events(plan: SystemPlan, kept: Sequence[int] = (), drifting: Sequenc
     acting[: events.n_clocks] = False
     chooses = mine & ~clocked & table.are(EventFlag.REVOCABLE)[table.event]
     chooses &= (table.discrete >= 0) & (table.discrete < events.n_visible)
+    # Hidden discrete values leave no choice: relations follow their sides.
     flips = _flips(np.unique(table.discrete[chooses]).tolist(), len(events.discrete))
     return RestingEvents(unknown, ticking, computed, acting, ignored, flips)
 
@@ -99,6 +100,7 @@ def recomputed(
     wrote each, or −1."""
     values, _ = _written(system, t, inputs, x, q)
     place = events.computed
+    # Values stay as the search has found them: what is added is zero, and has the expression's derivative.
     moving = values[jnp.maximum(writer[place], 0)]
     return q.at[place].add(jnp.where(writer[place] >= 0, moving - jax.lax.stop_gradient(moving), 0.0))
 
@@ -135,6 +137,7 @@ def after_event(
     happens = (jnp.asarray(table.event) == event) & ~events.ignored
     is_state, is_discrete = np.flatnonzero(plan.state >= 0), np.flatnonzero(table.discrete >= 0)
     place = plan.state[is_state]
+    # Added, not set: of several actions on one state, those whose events do not happen add zero, whatever their order.
     x = x.at[place].add(jnp.where(happens[is_state], values[is_state] - x[place], 0.0))
     place, mine = table.discrete[is_discrete], happens[is_discrete]
     q = q.at[place].add(jnp.where(mine, values[is_discrete] - q[place], 0.0))
@@ -157,6 +160,7 @@ def both_sides(
     values, _ = _written(system, t, inputs, x, q)
     rows = np.flatnonzero((table.discrete >= 0) & ~events.ignored)
     place, mine = table.discrete[rows], near[table.event[rows]]
+    # A relation has an event for each direction, which write 1 and 0: the largest and the least are its two sides.
     most = jnp.full_like(q, -jnp.inf).at[place].max(jnp.where(mine, values[rows], -jnp.inf))
     least = jnp.full_like(q, jnp.inf).at[place].min(jnp.where(mine, values[rows], jnp.inf))
     written = jnp.isfinite(most)
@@ -169,6 +173,7 @@ def ticked(
     """(x, q) after the sampled events with these numbers, in order, at one instant."""
     plan = system.plan.some_events
     table, previous = plan.table, q
+    # One after the other: each reads what those before it have written at this instant, and `previous` from before all.
     for event in ticking:
         values = system.around_event(t, q, previous, inputs).event_values(x) / jnp.asarray(plan.factor, x.dtype)
         rows = np.flatnonzero(table.event == event)
@@ -196,5 +201,6 @@ def guard_rounding(system: AcausalSystem, here: Numeric, x: Numeric) -> Array:
     (guards,)."""
     plan = system.plan
     places = np.concatenate([plan.states, plan.carried]).astype(np.int64)
+    # Equations are solved to a part of each unknown's size, which its guard is off by in turn.
     sizes = jnp.maximum(jnp.abs(x), jnp.asarray(declared_scale(plan.model)[places], x.dtype))
     return solved(x.dtype) * (jnp.abs(jax.jacfwd(here.guards)(x)) @ sizes)

@@ -81,6 +81,7 @@ def linearize(
     if at is None:
         found, t, read = equilibrium_from(system, t, given, None, Drifting(), throw=None)
         at = point_of(system, found, t, read, drifting=Drifting(), singular_is_error=False, throw=None)
+    # Each member of a batch may have coordinates of its own, and so other states.
     if jnp.ndim(at.x) != 1:
         raise ModelError("the operating point is a batch: linearize each with equinox.filter_vmap")
     values = read_inputs(system.plan, dtype, {**by_entry(system.plan, at.inputs), **given})
@@ -153,6 +154,7 @@ def _coordinates(system: AcausalSystem, partials: Partials, wanted: Sequence[str
         if wanted is not None and set(wanted) != set(system.states):
             raise ModelError(f"states: no hidden constraint makes a state redundant; all are needed: {system.states}")
         return Coordinates(np.arange(n), np.arange(0), np.arange(0))
+    # In units of nominal sizes: which entry is large must not depend on the units of states.
     scaled = None if is_traced(h_x) else np.asarray(h_x) * np.asarray(system.plan.nominal[:n])
     chosen = None if scaled is None else choose_coordinates(scaled)
     if wanted is None:
@@ -167,6 +169,7 @@ def _coordinates(system: AcausalSystem, partials: Partials, wanted: Sequence[str
     rows = np.arange(c) if chosen is None else chosen.rows
     if len(set(kept)) != n - len(rows):
         raise ModelError(f"states: {n - len(rows)} coordinates are needed, of {system.states}; got {list(wanted)}")
+    # The states named are coordinates if those that are left can be eliminated.
     if scaled is not None and len(choose_coordinates(scaled[rows], dependent).dependent) < len(rows):
         raise ModelError(
             f"states: {list(wanted)} do not determine the other states at this point; "

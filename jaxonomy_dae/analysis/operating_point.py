@@ -46,6 +46,7 @@ class OperatingPoint(eqx.Module):
         single = isinstance(name, str)
         if not single and not (isinstance(name, Sequence) and all(isinstance(one, str) for one in name)):
             raise ModelError(f"read a point by names, point['m.x'] or point[['m.x', 'm.y']]; got {name!r}")
+        # A batch is read member by member: `observe` takes one point.
         if self.x.ndim > 1:
             return eqx.filter_vmap(lambda one: one[name])(self)
         plan = self.system.plan

@@ -67,6 +67,7 @@ def partials_at(system: AcausalSystem, point: Driven, quantity: tuple[int, ...],
         return here.semi_explicit(full)[:n], here.constraint_vector(full), y
 
     def of(q):
+        # The values come with their derivatives, from the same evaluation.
         def twice(*given):
             state, u, held = given
             found = everything(state, u, held, q)
@@ -78,6 +79,7 @@ def partials_at(system: AcausalSystem, point: Driven, quantity: tuple[int, ...],
         (of_slopes, of_constraints, of_outputs), (slopes, _, y) = of(q)
         return Partials(slopes, y, of_slopes, of_constraints, of_outputs, jnp.array(True), jnp.zeros(0, bool))
     sides, near = both_sides(system, t, values, events, x, q)
+    # The first side is the point itself, whose derivatives are taken; the others are compared with it.
     on_sides = jax.vmap(of)(sides.at[0].set(q))
     (of_slopes, of_constraints, of_outputs), (slopes, _, y) = jax.tree.map(lambda a: a[0], on_sides)
     agree = jnp.stack([_alike(leaf) for leaf in jax.tree.leaves(on_sides)]).all()
@@ -86,6 +88,7 @@ def partials_at(system: AcausalSystem, point: Driven, quantity: tuple[int, ...],
 
 def _alike(sides: Array) -> Array:
     """Whether rows are the same, to half of the digits of the largest entry."""
+    # Branches that meet with one slope differ by rounding alone. Kinks differ by parts of order one.
     allowed = spacing(sides.dtype) ** 0.5 * jnp.max(jnp.abs(sides), initial=0.0)
     return jnp.all(jnp.abs(sides - sides[0]) <= allowed)
 
@@ -93,6 +96,7 @@ def _alike(sides: Array) -> Array:
 def _moves(plan: SystemPlan, near: Array) -> Array:
     """Whether one of these events lets states jump, or ends the run."""
     events = plan.some_events
+    # `ends` is a new array at each read, so that writing into it changes no table.
     moves = events.table.ends
     moves[events.table.event[events.state >= 0]] = True
     return jnp.any(near & moves)

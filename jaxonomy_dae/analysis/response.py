@@ -51,6 +51,7 @@ class FrequencyResponse(eqx.Module):
 
         The two axes.
         """
+        # When it is called: `plotting` stands above this room.
         from ..plotting import bode
 
         return bode(self, *pairs, axes=axes)

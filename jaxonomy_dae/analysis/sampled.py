@@ -118,19 +118,23 @@ def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
     declared = [plan.table.events[e].clock for e in clocks]
     if known is None and len(set(declared)) == 1:  # their order is known whatever the period is
         return Instants((tuple(clocks),), ((0,) * len(clocks),), dict.fromkeys(clocks, 1))
+    # Numbers can be sorted inside jit, too; values of parameters are not known there.
     if known is None and any(part.parameters for clock in declared for part in clock):
         raise ModelError(
             "inside jit, grad and vmap the order of ticks cannot be told by the values of periods that are parameters: "
             "write them as numbers, or give all clocks one period and one offset"
         )
+    # Inside jit, too, times are computed now: they decide in which order clocks tick.
     with jax.ensure_compile_time_eval():
         numbers = jnp.zeros((0,)) if known is None else jnp.asarray(known)
+        # Clocks read parameters alone: networks, inputs and sizes of this point are left out.
         both = SystemAt(system.plan, numbers, (), 0.0, {}, jnp.zeros((0,))).clocks()
     periods, offsets = (np.asarray(v, float)[clocks] for v in both)
     equal = _equal(system.parameters.array.dtype)
     shortest = periods.min()
     ratios = [Fraction(p / shortest).limit_denominator(RATIO) for p in periods.tolist()]
     apart = np.abs(np.array([float(r) for r in ratios]) * shortest - periods) > equal * periods
+    # In units of the shortest period divided by `grid`, all periods are integers.
     grid = np.lcm.reduce([r.denominator for r in ratios])
     parts = [int(r * int(grid)) for r in ratios]
     common = int(np.lcm.reduce(parts))
@@ -154,6 +158,7 @@ def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
             groups[-1].append((time, e, number))
         else:
             groups.append([(time, e, number)])
+    # Events of one instant happen in the order of their numbers, as in runs.
     ordered = [sorted(group, key=lambda entry: entry[1]) for group in groups]
     return Instants(
         tuple(tuple(e for _, e, _ in group) for group in ordered),

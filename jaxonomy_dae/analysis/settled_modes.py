@@ -109,6 +109,7 @@ def settle(
         )
 
     shapes = jax.eval_shape(search, begin)
+    # A loop needs values before the first search; they decide nothing.
     here, root = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
     nothing = here, root, jnp.array(-1)
     state = _Search(

@@ -174,12 +174,14 @@ def _not_found(system: AcausalSystem, found: Equilibrium, drifting: Drifting) ->
         return _restless(system, int(found.event))
     residual, limit = np.abs(np.asarray(found.residual)), np.asarray(found.limit)
     excess = residual / np.where(limit > 0, limit, np.finfo(limit.dtype).tiny)
+    # A row that is not a number is the first to be named.
     excess = np.where(np.isfinite(excess), excess, np.inf)
     rows = _row_names(system, drifting)
     worst = [k for k in np.argsort(-excess, kind="stable")[:WORST].tolist() if excess[k] > 1]
     left = "; ".join(f"{rows[k]} = {float(found.residual[k]):.3g}" for k in worst)
     text = f"no equilibrium was found; where the search ended, these are not zero: {left}."
     written = _written_names(system, drifting)
+    # Rows of clocks stand last, so that their places count from the end.
     counted = [written[k - len(rows)] for k in worst if k >= len(rows) - len(written)]
     if counted:
         return f"{text} If what a clock changes at each tick may go on, as a counter does, say drifting={counted}"
@@ -237,6 +239,7 @@ def _undetermined(system: AcausalSystem, found: Equilibrium, drifting: Drifting)
     for direction in np.abs(np.asarray(directions)[np.asarray(is_open(values))]):
         inside = names[direction > IN_DIRECTION * direction.max()].tolist()
         loose.append(inside)
+    # Two directions of the same states are one finding for a reader.
     return [names for k, names in enumerate(loose) if names not in loose[:k]]
 
 
@@ -244,6 +247,7 @@ def _enough(system: AcausalSystem, found: Equilibrium, drifting: Drifting) -> st
     """States that may drift so that the others are determined: a mass that friction holds keeps its place and speed."""
     names, n_rows = _unknown_names(system, drifting), len(unknowns(system.plan, drifting.states))
     kept, left = list(range(len(names))), found
+    # One at a time: to hold a state also takes its row away, which may open another direction.
     while len(kept) and (loose := np.flatnonzero(np.asarray(is_open(open_directions(left)[0])))).size:
         direction = np.abs(np.asarray(open_directions(left)[1]))[loose[0]]
         del kept[int(np.argmax(direction > IN_DIRECTION * direction.max()))]

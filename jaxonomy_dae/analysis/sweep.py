@@ -136,6 +136,7 @@ def sweep(
         rows = tuple(columns.values())
         shape = (sizes[0],)
     else:
+        # One row for each combination, so that a grid is vectorized as zipped values are.
         places = np.array(list(itertools.product(*map(range, sizes))), np.int64).reshape(-1, len(sizes))
         rows = tuple(v[places[:, k]] for k, v in enumerate(columns.values()))
         shape = tuple(sizes)
@@ -156,6 +157,7 @@ class _Simulation(eqx.Module):
 
 @functools.partial(compiled, optimize=True)
 def _mapped(function: Callable, system: AcausalSystem, names: tuple[str, ...], rows: tuple[Array, ...]) -> PyTree:
+    # Names are static and values traced, so that other values find the program compiled.
     def one(row):
         return function(system.with_parameters(dict(zip(names, row, strict=True))))
 
@@ -172,12 +174,14 @@ def _raise_first(
         return
     count = len(rows[0])
     failed = np.zeros(count, bool)
+    # A run that failed is not-a-number from there on.
     for leaf in arrays:
         failed |= np.isnan(np.asarray(leaf).reshape(count, -1)).any(axis=1)
     if not failed.any():
         return
     values = {name: np.asarray(row)[int(failed.argmax())] for name, row in zip(columns, rows, strict=True)}
     try:
+        # What a compiled program returns carries no text: the function by itself raises the error.
         function(system.with_parameters(values))
     except (InitializationError, SimulationError, SteadyStateError) as error:
         where = ", ".join(f"{name} = {np.array2string(value, precision=6)}" for name, value in values.items())

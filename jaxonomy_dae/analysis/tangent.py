@@ -29,6 +29,7 @@ def choose_coordinates(jacobian: Float[np.ndarray, "c n"], give_way: np.ndarray 
     may."""
     c, n = jacobian.shape
     norm = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    # A constraint multiplied by 1e9 is the same constraint, and must not be the first pivot for that.
     left = jacobian / np.where(norm > 0, norm, 1)
     if give_way is not None:
         left[:, np.setdiff1d(np.arange(n), give_way)] = 0.0

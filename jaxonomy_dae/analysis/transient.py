@@ -35,6 +35,7 @@ def pseudo_transient(
         return jax.jacfwd(lambda w: (scaled(w),) * 2, has_aux=True)(w)
 
     def sizes(jacobian, value):
+        # Rows have units of their own. In units of what its terms can change by, each counts alike.
         size = jnp.sum(jnp.abs(jacobian), axis=1) + jnp.abs(value)
         return jnp.where(size > 0, size, 1)
 
@@ -57,7 +58,9 @@ def pseudo_transient(
         after = scaled(w + change)
         off = jnp.max(jnp.abs(inertia * change / h - after) / size)
         now = jnp.max(jnp.abs(value) / size)
+        # `off` is what is left of the implicit Euler equation after its one Newton step.
         fine = jnp.isfinite(off) & (off <= LEFT * now)
+        # A step that is not kept is tried again, shorter, from the same point.
         w = jnp.where(fine, w + change, w)
         left = jnp.where(fine, jnp.max(jnp.abs(after) / size), left)
         return count + 1, w, h * jnp.where(fine, LONGER, SHORTER), left

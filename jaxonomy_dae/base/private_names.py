@@ -123,6 +123,7 @@ def missing(names: tuple[str, ...]) -> str | None:
         wanted = SHAPES.get(name)
         if wanted is None:
             continue
+        # A further field does no harm. A further argument would be missing in calls.
         lacking = wanted - _names_in(found) if dataclasses.is_dataclass(found) else wanted ^ _names_in(found)
         if lacking:
             return f"{_versions(path)} has another {path}: {', '.join(sorted(lacking))}"

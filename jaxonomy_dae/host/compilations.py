@@ -58,6 +58,7 @@ def compilations() -> tuple[Compilation, ...]:
 def timed() -> Iterator[list[float]]:
     """Appends the processor seconds spent within it to the list."""
     spent: list[float] = []
+    # Processor time: a clock would count other processes, and waiting for them.
     begin = time.process_time()
     try:
         yield spent

@@ -122,6 +122,7 @@ def _machine() -> str:
     """What the machine code of this process may rely on."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
+        # Each core has these lines. How many cores there are must not count.
         told = [line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))]
         processor = "\n".join(sorted(set(told)))
     except OSError:
@@ -211,10 +212,11 @@ def _write(path: Path, content: bytes) -> None:
         # A rename is atomic within one folder: a reader sees the whole file or none.
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix="new-", suffix=".program", delete=False) as file:
             draft = file.name
+            # The digest shows a file that was cut off, or has changed on its disk.
             file.write(hashlib.sha256(content).digest() + content)
         os.replace(draft, path)
         draft = None
-        _make_room(path.parent)
+        make_room(path.parent, OURS, ROOM)
     except OSError:  # a full disk, no permission
         pass
     finally:
@@ -249,20 +251,22 @@ def _delete(path: Path) -> None:
         path.unlink()
 
 
-def _make_room(where: Path) -> None:
-    """Deletes the package's files that were used least recently, if all together take more than the room."""
+def make_room(where: Path, ours: re.Pattern[str], room: int) -> None:
+    """Deletes the package's files, whose names are `ours`, that were used least recently, if all together take more
+    than the room."""
     files = []
     for entry in os.scandir(where):
-        if OURS.fullmatch(entry.name):
+        if ours.fullmatch(entry.name):
             with contextlib.suppress(OSError):
                 status = entry.stat(follow_symlinks=False)
                 files.append((status.st_mtime, status.st_size, entry.path))
     taken = sum(size for _, size, _ in files)
-    if taken <= ROOM:
+    if taken <= room:
         return
+    # By date: the least recently used first.
     for _, size, path in sorted(files):
         with contextlib.suppress(OSError):
             os.unlink(path)
         taken -= size
-        if taken <= AFTER * ROOM:
+        if taken <= AFTER * room:
             return

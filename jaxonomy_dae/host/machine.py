@@ -37,6 +37,7 @@ def memory() -> Use | None:
     """The memory that this process holds, of all that it could have (bytes); None where the system does not say."""
     try:
         resident = int(STATUS.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        # MemAvailable counts what the system can take back from its caches; MemFree does not.
         fields = dict(line.split(":", 1) for line in MEMORY.read_text().splitlines())
         available = int(fields["MemAvailable"].split()[0]) * 1024
     except (OSError, ValueError, KeyError, IndexError):

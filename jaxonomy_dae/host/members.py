@@ -38,6 +38,7 @@ def values_of_members(leaf: Any) -> np.ndarray:
     """The values of a leaf without a shape of its own, one for each member: an axis for each `jax.vmap` around it, the
     outermost first."""
     *around, values = layers(leaf)
+    # The last layer is of the outermost `jax.vmap`, and its axis counts among those of all others: it goes first.
     axes = [layer.batch_dim for layer in around if getattr(layer, "batch_dim", None) is not None]
     values = np.asarray(values)
     for place, axis in enumerate(reversed(axes)):

@@ -51,6 +51,7 @@ def reason(call: Call, known: Sequence[Call]) -> str:
     changed = [
         f"{p} was {_short(a)}, is {_short(b)}"
         for p, a, b in zip(paths, other.static, call.static, strict=True)
+        # By their texts, since 1, 1.0 and True are equal and make different programs.
         if repr(a) != repr(b)
     ]
     pairs = zip(arrays, other.types, call.types, strict=False)

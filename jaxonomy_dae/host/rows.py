@@ -19,6 +19,7 @@ def size_for(n: int) -> int:
     doubled = 1 << max(n - 1, 0).bit_length()
     if doubled <= DOUBLED:
         return doubled
+    # `doubled // 2` is the last power of two below n.
     part = doubled // 2 // PARTS
     return -(-n // part) * part
 

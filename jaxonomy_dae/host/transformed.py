@@ -174,6 +174,7 @@ class Function:
                 except (TypeError, ValueError):  # JAX 0.10.2 takes a stacked zero of a scan for one of its steps
                     return pulled_by([jnp.zeros(c.shape, c.dtype) for c in cotangents])
 
+            # A pullback may be kept for other processes. What is derived further, from it or from the values, may not.
             values.pulls = False
             transpose = values._derive(
                 ("pullback", read, structure, whole), f"gradient of {self.name}", f"pullback {read} {whole}"

@@ -53,10 +53,12 @@ def _out(part: Any) -> Any:
     if kind in (tuple, list):
         return [kind.__name__, *map(_out, part)]
     if kind is float:
+        # Exact, and with texts for infinity and not-a-number, which JSON lacks.
         return ["float", part.hex()]
     if kind is dict:
         return ["dict", *([_out(key), _out(value)] for key, value in part.items())]
     if isinstance(part, PyTreeDef):
+        # A structure cannot be written itself: a tree that has it is, with zeros for leaves.
         return ["structure", _out(jax.tree.unflatten(part, [0] * part.num_leaves))]
     if isinstance(part, np.dtype):
         return ["dtype", part.str]
@@ -121,6 +123,7 @@ def _found(name: str) -> Any:
     module, _, path = name.partition(":")
     if module == "builtins":
         return next(one for one in _BUILT_IN if one.__name__ == path)
+    # No other module is imported: a file must not choose what code runs.
     if module.partition(".")[0] in (PACKAGE, *LIBRARIES):
         importlib.import_module(module)
     if owner(module) is not Owner.KNOWN:

@@ -40,6 +40,7 @@ def increasing(values: object, name: str, what: str) -> np.ndarray:
     if found.ndim != 1 or len(found) < 2:
         raise ModelError(f"'{name}': {what} needs a row of at least 2 points; got shape {found.shape}")
     if not (np.diff(found) > 0).all():
+        # The first False: where the order breaks.
         place = int(np.argmin(np.diff(found) > 0))
         twice = found[place + 1] == found[place]
         mend = "part the two points a little, or write a jump as a Piecewise or a Step" if twice else "sort it"

@@ -85,6 +85,7 @@ class _Cell(TwoPin):
         start = self.parameter("initial_soc", given.initial_soc, unit="1")
         z = self.variable("soc", start=start, fixed=True, unit="1")
         voltage, current = self._two_pins()
+        # No event where the current turns: with an efficiency near one the slope of soc hardly bends.
         reacting = current - (1 - efficiency) * smooth(Max(current, 0))
         self.add_equations(Eq(charge * der(z), reacting))
         overpotentials, heat = sympy.Integer(0), sympy.Integer(0)
@@ -203,6 +204,7 @@ class HeatedCell(_Cell):
         heat = self.port("heat", Thermal)
         c = self._circuit(_CellData(soc, ocv, Q, R0, R, C, eta, initial_soc, initial_voltage, kind))
         voltage = self.output("ocv", c.table + entropy * (heat.T - reference), unit="V")
+        # A parameter for its unit's sake: a plain number in an equation has none, and `check_units` would object.
         gas = self.parameter("gas_constant", GAS_CONSTANT, unit="J/(mol*K)", bounds=POSITIVE)
         r = self.output("r", resistance * exp(activation / gas * (1 / heat.T - 1 / reference)), unit="Ohm")
         lost = r * c.current**2 + c.heat + voltage * (c.current - c.reacting)
@@ -245,6 +247,7 @@ class _Pack(Component):
                 f"'{self.name}': {what} has shape {np.shape(value)}: give one value for all cells, or one for each in "
                 f"shape {shape}"
             )
+        # `add_array` gives one entry to each cell of an array, and all of a list to each cell.
         return np.asarray(value)
 
     def _values(self, shape: tuple[int, int], values: dict[str, Each]) -> dict[str, Each]:
@@ -264,6 +267,7 @@ class _Pack(Component):
                 options[what] = [self._each(f"{what}{k}", v, shape, unit, bounds) for k, v in enumerate(row, start=1)]
         own = {what: getattr(given, what) for what in ("Q", "R0", "eta", "initial_soc")}
         options |= self._values(shape, own | more)
+        # A list, so that each cell gets all points.
         points = np.asarray(given.soc).tolist()
         cells = self.add_array("cell", kind, shape, points, volts, kind=given.kind, **options)
         self.connect(p, cells[0].p)

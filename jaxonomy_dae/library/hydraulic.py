@@ -105,6 +105,7 @@ class HydraulicCapacity(Component):
         start = start_of(self, "initial_pressure", initial_pressure, "Pa", ATMOSPHERE)
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         fluid = self.port("fluid", Hydraulic)
+        # In bar. By default tolerances would be in pascals, five decades tighter than anyone asks for.
         p = self.variable("p", nominal=1e5, **start)
         self.add_equations(Eq(p, fluid.p), Eq(density * compliance * der(p), fluid.m_flow))
         self.declare_energy(compliance * p**2 / 2)
@@ -138,6 +139,7 @@ class Accumulator(Component):
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         fluid = self.port("fluid", Hydraulic)
         volume = self.variable("V_fluid", nominal=1e-3, **start)
+        # Bounded, so that the search for a start takes no negative volume to a power.
         gas = self.variable("V_gas", nominal=1e-3, unit="m3", bounds=POSITIVE)
         self.add_equations(
             Eq(density * der(volume), fluid.m_flow),
@@ -166,6 +168,8 @@ class _TwoPort(Component):
         return dp, flow
 
 
+# The root itself has an infinite slope at zero, where a flow that turns would stop Newton's method and the step
+# control.
 def _regularised_root(x: sympy.Expr, small: sympy.Expr) -> sympy.Expr:
     """x/(x² + small²)^(1/4): sign(x)·√|x| where |x| ≫ small, and x/√small, with a finite slope, where |x| ≪ small.
 
@@ -256,6 +260,7 @@ class ReliefValve(_Restriction):
         dp_small: Value = 100.0,
     ):
         super().__init__(ev, name)
+        # Two pressures: with one, the fall of dp as it opens would shut the valve at once.
         upper, lower = self.parameter("p_open", p_open, unit="Pa"), self.parameter("p_close", p_close, unit="Pa")
         in_order(self, "p_close", "p_open")
         through, flow = self._through(A, Cd, rho, dp_small)

@@ -47,6 +47,7 @@ def _interpolated(
         value += slope * inside + 2 * bend * inside**2 - bend / width * inside**3
         integral += slope * inside**2 / 2 + 2 * bend * inside**3 / 3 - bend / width * inside**4 / 4 + rise * beyond
         before = chord
+    # No events at the points: steps that end at each kink would cost more than the kinks do.
     return smooth(value), smooth(integral)
 
 

@@ -120,6 +120,7 @@ def penetration(s: Value, gap: Value, smooth: Value) -> tuple[sympy.Expr, sympy.
     """A dead zone: (distance of `s` beyond ±gap/2, its derivative by `s`), with corners rounded over the length
     `smooth`."""
     above, below = s - gap / 2, -s - gap / 2
+    # (x + √(x² + smooth²))/2 tends to x above zero and to nothing below: the corner max(x, 0), rounded.
     root_above, root_below = sqrt(above**2 + smooth**2), sqrt(below**2 + smooth**2)
     depth = (above + root_above - below - root_below) / 2
     return depth, 1 + (above / root_above + below / root_below) / 2
@@ -217,6 +218,7 @@ class MovedAtSpeed(OnAxis):
     def _move(self, initial: Value) -> None:
         start = self.parameter(self.axis.initial, initial, unit=self.axis.position_unit)
         position, effort = self._flange()
+        # A speed leaves the position open: it is a state with a start of its own.
         where = self.variable(self.axis.position, start=start, fixed=True, unit=self.axis.position_unit)
         self.add_equations(Eq(where, position), Eq(der(where), self.input("u", unit=self.axis.speed_unit)))
         self.declare_supply(-effort * der(where))

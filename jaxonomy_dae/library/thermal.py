@@ -30,6 +30,7 @@ class HeatCapacitor(Component):
         capacity = self.parameter("C", C, unit="J/K", bounds=POSITIVE)
         heat = self.port("heat", Thermal)
         start = start_of(self, "initial_temperature", initial_temperature, "K", 293.15)
+        # Temperatures are absolute: with a nominal value of one, absolute tolerances would be 300 times as tight.
         temperature = self.variable("T", nominal=300.0, **start)
         self.add_equations(Eq(temperature, heat.T), Eq(capacity * der(temperature), heat.Q_flow))
         self.declare_energy(capacity * temperature)
@@ -80,6 +81,7 @@ class Radiation(_TwoPort):
         super().__init__(ev, name)
         emissivity = self.parameter("eps", eps, unit="1", bounds=(0.0, 1.0))
         area = self.parameter("A", A, unit="m2", bounds=NONNEGATIVE)
+        # A parameter for its unit's sake, as `check_units` takes plain numbers to have none.
         sigma = self.parameter("sigma", STEFAN_BOLTZMANN, unit="W/(m2*K4)", bounds=POSITIVE)
         _, flow = self._two_ports()
         # Continued below zero so that it still rises there: the search for a start finds no negative temperatures.

@@ -116,6 +116,7 @@ class ElasticStop(_Compliant):
         s, f = self._two_flanges()
         speed = self.variable("v_rel", unit="m/s")
         touching = self.discrete("touching", start=0, unit="1")
+        # By the discrete variable, not by s < length: the branch then changes at events only, where `touching` says so.
         depth = Piecewise((least - s, Eq(touching, 1)), (0, True))
         pushed = stiffness * depth
         meets, parts = (self.relation(r) for r in (damping * speed < -pushed, damping * speed > pushed))

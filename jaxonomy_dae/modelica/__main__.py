@@ -34,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given[:1] == ["pack"]:
         return packing.main(given[1:])
     asked = _parser().parse_args(given)
+    # This process is the command's own. The package itself never sets it.
     jax.config.update("jax_enable_x64", True)
     try:
         flat = load(Path(asked.file), asked.model, asked.root)

@@ -89,6 +89,7 @@ def flattened(
     variables = alone.flat["variables"]
     declared, equations, renamed = [f"{name} {modified};"], [], {}
     if "world.enableAnimation" in variables:
+        # Without animation, whose shapes are variables that nothing reads.
         declared.append("inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false);")
     for k, top in enumerate(streams):
         declared += _rim(k, top, variables)
@@ -110,6 +111,7 @@ def _alone(
 ) -> tuple[Flattened, list[str]]:
     """The class by itself, and the overdetermined records that need a root outside."""
     extended = f"extends {name}({changes});" if changes else f"extends {name};"
+    # rumoca names one record without a root at a time, so that each one costs another flattening.
     trees: list[str] = []
     while True:
         try:
@@ -219,6 +221,7 @@ def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) ->
     outer = frozenset(n for n in names if not n.startswith((_INSIDE, _RIM)))
 
     def under_own_names(of: Json, also: Mapping[str, str]) -> Json:
+        # As text, since names stand in many lists of these records.
         text = json.dumps(of).replace(f'"{_INSIDE}.', '"')
         for before, after in also.items():
             text = text.replace(f'"{before}"', f'"{after}"')
@@ -260,6 +263,7 @@ def without_boundaries(model: FlatModel, outer: frozenset[str]) -> FlatModel:
     around -= {re.sub(r"\[[\d,]+\]$", "", n) for n in parameters}
     mine = [(e, names) for e, names in kept if not names or names - around - parameters]
     others = [(e, names) for e, names in kept if names and not names - around - parameters]
+    # What the class reads of an outer component belongs to it, with all that determines this.
     read = {n for _, names in mine for n in names & around}
     while more := [(e, names) for e, names in others if names & read and (e, names) not in mine]:
         mine += more

@@ -30,6 +30,7 @@ def _sign(x: float) -> int:
 
 def _quotient(a: Value, b: Value) -> Value:
     """The quotient without its fraction, rounded towards zero."""
+    # The sign needs no event: the whole part beside it is zero where it jumps.
     q = sympy.sympify(a) / sympy.sympify(b)
     return smooth(sympy.sign(q)) * sympy.floor(smooth(sympy.Abs(q)))
 
@@ -46,6 +47,7 @@ def _extreme(smaller: bool) -> Callable[..., Value]:
             return functools.reduce(both if smaller else either, entries)
         if all(isinstance(e, int | float) for e in entries):
             return number(entries)
+        # Unevaluated: SymPy would compare all pairs of entries.
         return smooth(symbol(*entries, evaluate=False))
 
     return extreme
@@ -79,13 +81,42 @@ def product(value: Value) -> Value:
     return out
 
 
-def matrix_product(a: list, b: Value) -> Value:
+def matrix_product(a: list, b: list) -> Value:
     """The product of arrays of one or two dimensions."""
+    columns = sizes(a)[-1] if a else 0
+    if columns != len(b):
+        raise ModelError(f"the product of arrays of sizes {sizes(a)} and {sizes(b)}: {columns} is not {len(b)}")
     if not isinstance(a[0], list):
         if not isinstance(b[0], list):
             return total([x * y for x, y in zip(a, b, strict=True)])
         return [total([x * row[j] for x, row in zip(a, b, strict=True)]) for j in range(len(b[0]))]
     return [matrix_product(row, b) for row in a]
+
+
+def matrix_power(a: list, n: Value) -> list:
+    """A square matrix times itself, as `a ^ n` means; `a .^ n` is the power of each entry (Modelica Language
+    Specification 3.6, section 10.6.7)."""
+    if len(set(sizes(a))) != 1 or len(sizes(a)) != 2 or not isinstance(n, int | float) or n < 0 or int(n) != n:
+        raise ModelError(f"a square matrix has powers 0, 1, 2, …; got sizes {sizes(a)} to the power {n}")
+    out = _identity(len(a))
+    for _ in range(int(n)):
+        out = matrix_product(out, a)
+    return out
+
+
+def _identity(n: int) -> list:
+    return [[1.0 if i == j else 0.0 for j in range(n)] for i in range(n)]
+
+
+def symmetric(a: list) -> list:
+    """The matrix with its upper triangle below the diagonal, too."""
+    return [[a[min(i, j)][max(i, j)] for j in range(len(a))] for i in range(len(a))]
+
+
+def rows_joined(rows: Sequence[Sequence[Value]]) -> list:
+    """`[a, b; c, d]`: entries become matrices, a vector a column, and are joined from left to right, then rows from top
+    to bottom (section 10.4.2)."""
+    return concatenated(1, *(concatenated(2, *(promoted(entry, 2) for entry in row)) for row in rows))
 
 
 def transposed(a: list) -> list:
@@ -133,7 +164,7 @@ def _semi_linear(x: Value, positive: Value, negative: Value) -> Value:
 
 
 def _text(value: Value, *_: Value, **__: Value) -> str:
-    return str(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _boolean_as_integer(value: Value) -> Value:
@@ -164,12 +195,13 @@ FUNCTIONS: dict[str, Callable[..., Value]] = {
     "fill": filled,
     "zeros": lambda *n: filled(0.0, *n),
     "ones": lambda *n: filled(1.0, *n),
-    "identity": lambda n: [[1.0 if i == j else 0.0 for j in range(n)] for i in range(n)],
+    "identity": _identity,
     "diagonal": lambda v: [[v[i] if i == j else 0.0 for j in range(len(v))] for i in range(len(v))],
     "linspace": _linspace,
     "cat": concatenated,
     "promote": promoted,
     "transpose": transposed,
+    "symmetric": symmetric,
     "cross": _cross,
     "skew": lambda x: [[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]],
     "outerProduct": lambda a, b: [[x * y for y in b] for x in a],
@@ -208,6 +240,7 @@ def numbers_checked(what: Callable[[], str]) -> Iterator[None]:
 
 def power(a: Value, b: Value) -> Value:
     if isinstance(a, int | float) and isinstance(b, int | float):
+        # Python's power of a negative number would be complex.
         found = a**b if a >= 0 or float(b).is_integer() else math.nan
         float(found)  # an integer may be too large to be a Real
         return found
@@ -223,4 +256,5 @@ def quotient(a: Value, b: Value) -> Value:
         return a / b
     if isinstance(b, int | float) and b == 0:
         raise ModelError(f"division of {a} by zero")
+    # Modelica divides Reals, where SymPy would keep a fraction of integers.
     return a / sympy.Float(b) if isinstance(b, int | float) else a / b

@@ -82,6 +82,7 @@ class _Writer:
             return name
         source = found.source
         empty = Class(source.kind, name, literals=source.literals, external=source.external)
+        # Noted before what is inside is written, since a function may call itself.
         self.classes[name] = empty
         if source.literals:
             return name

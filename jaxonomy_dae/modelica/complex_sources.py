@@ -38,6 +38,7 @@ def with_real_equations(sources: Sources, text: str) -> str:
 def _tried(sources: Sources, text: str, of: Found, mark: Mark) -> Iterator[Change]:
     if not (isinstance(mark.right, tree.Call) and mark.right.function == "connect"):
         with contextlib.suppress(_NotSplit, RecursionError):
+            # All changes of an equation or none: what is not understood may show when a part of it has been split.
             yield from list(_changed(_Complex(sources, of, {}, frozenset(mark.local)), mark, text))
 
 
@@ -80,6 +81,7 @@ class _Complex:
 
     def within(self, iterators: tuple[tuple[str, tree.Expression | None], ...]) -> "_Complex":
         """As in the value of a comprehension."""
+        # Not by the constructor, which would gather the declarations of the class again.
         inner = object.__new__(_Complex)
         inner.__dict__.update(self.__dict__, local=self.local | {n for n, _ in iterators})
         return inner
@@ -385,6 +387,7 @@ class _Complex:
         self.values[name] = self.pair(value) if self.is_complex(value) else self.real(value)
 
     def _of_entries(self, e: tree.Call, which: list[bool]) -> tree.Expression | Pair:
+        # A call within the arguments of another one counts by a name of its own.
         depth = sum(n.startswith(_ENTRY) for n in self.local)
         name = f"{_ENTRY}{depth}"
         place = tree.Reference((name,))

@@ -39,6 +39,7 @@ def equal(scope: Scope, left: Expression, right: Expression) -> list[Sides]:
 def add(scope: Scope, sides: Sides) -> None:
     """Adds an equation of two values."""
     left, right = map(as_number, sides)
+    # Texts decide nothing that a run computes.
     if isinstance(left, str) or isinstance(right, str):
         return
     if isinstance(left, int | float) and isinstance(right, int | float):
@@ -84,6 +85,7 @@ def side_by_side(scope: Scope, s: Branches) -> list[Sides]:
 def _one_equation(scope: Scope, branches: list[tuple[Value, Sides]]) -> Sides:
     """One equation of which a condition chooses the branch: of the right sides, where all left sides are the same."""
     left = branches[0][1][0]
+    # A common left side stays outside of the branches: the equation is solved for it whichever of them holds.
     same = all(sides[0] == left for _, sides in branches)
     value: Value = None
     for holds, (a, b) in reversed(branches):

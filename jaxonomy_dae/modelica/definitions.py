@@ -47,6 +47,7 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
     others = _with_choices(_by_entries(rest, model, is_discrete), is_discrete)
     sections = [section for section in model.algorithms if any(_whens_in(section))]
     by_when = set(with_entries(assigned_in((*whens, *(w for section in sections for w in _whens_in(section)))), model))
+    # In an algorithm with a when, what stands outside of it is kept, too: statements before and after read each other.
     by_when |= {n for section in sections for n in with_entries(assigned_in(section), model) if is_discrete(n)}
     algorithms = []
     for section in model.algorithms:
@@ -95,19 +96,31 @@ def _by_entries(
     statements: Iterable[tree.Statement], model: tree.Class, is_discrete: Callable[[str], bool]
 ) -> Iterator[tree.Statement]:
     """The statements with an equation for each entry of a discrete array that stands alone on the left."""
-    declared = {d.name for d in model.declarations if is_discrete(d.name)}
+    places: dict[str, list[str]] = {}
+    for d in model.declarations:
+        array, _, place = d.name.rpartition("[")
+        if array and is_discrete(d.name):
+            places.setdefault(array, []).append(place[:-1])
     for s in statements:
-        if not (isinstance(s, tree.Equality) and isinstance(s.left, tree.Reference)) or any(s.left.subscripts):
+        if not (isinstance(s, tree.Equality) and isinstance(s.left, tree.Reference)):
             yield s
             continue
-        right, k = s.right, 1
-        listed = right.entries if isinstance(right, tree.Array) else ()
-        while f"{s.left.path}[{k}]" in declared:
-            value = listed[k - 1] if k <= len(listed) else tree.Part(right, None, (tree.Number(k),))
-            yield tree.Equality(tree.Reference((f"{s.left.path}[{k}]",)), value, s.line)
-            k += 1
-        if k == 1:
+        if any(s.left.subscripts) or s.left.path not in places:
             yield s
+            continue
+        for place in places[s.left.path]:
+            entry = _entry_of(s.right, [int(k) for k in place.split(",")])
+            yield tree.Equality(tree.Reference((f"{s.left.path}[{place}]",)), entry, s.line)
+
+
+def _entry_of(e: tree.Expression, place: list[int]) -> tree.Expression:
+    """One entry of an array."""
+    if not place:
+        return e
+    if isinstance(e, tree.Array) and not any(isinstance(x, tree.Comprehension) for x in e.entries):
+        if place[0] <= len(e.entries):
+            return _entry_of(e.entries[place[0] - 1], place[1:])
+    return tree.Part(e, None, tuple(map(tree.Number, place)))
 
 
 def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool]) -> list[tree.Statement]:
@@ -124,6 +137,7 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
              if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(_name(e.left))}
             for body in bodies
         ]  # fmt: skip
+        # Without an else, nothing says what a variable is where no condition holds.
         names = [n for n in values[0] if all(n in v for v in values)] if conditions[-1] == tree.Truth(True) else []
         for n in names:
             branches = tuple((c, v[n]) for c, v in zip(conditions[:-1], values, strict=False))
@@ -227,21 +241,22 @@ def remembered(section: tuple[tree.Statement, ...], model: tree.Class) -> set[st
     def read(part: object, done: set[str]) -> None:
         found.update(entries(_name(e) for e in tree.each_part(part) if isinstance(e, tree.Reference)) - done)
 
-    def carried_out(statements: tuple[tree.Statement, ...], done: set[str]) -> set[str]:
+    def carried_out(statements: tuple[tree.Statement, ...], done: set[str], looped: bool = False) -> set[str]:
         """The variables that are assigned for sure after statements; `done` are those before."""
         for s in statements:
             if isinstance(s, tree.Assignment | tree.Equality):
                 read(s.right, done)
                 done = done | entries(assigned_in((s,)))
             elif isinstance(s, tree.Loop):
-                done = done | entries(assigned_in((s,)))
+                carried_out(s.body, done, True)
+                done = done | entries(assigned_in((s,)))  # at the end of loops that are carried out at least once
             elif isinstance(s, tree.Branches):
                 read(tuple(c for c, _ in s.branches), done)
-                ends = [carried_out(body, done) for _, body in s.branches]
+                ends = [carried_out(body, done, looped) for _, body in s.branches]
                 ends += [] if s.branches[-1][0] == tree.Truth(True) else [done]
                 done = set.intersection(*ends)
                 found.update(entries(assigned_in((s,))) - done)
-            elif isinstance(s, tree.Jump):
+            elif isinstance(s, tree.Jump) and not looped:
                 raise ModelError(
                     f"line {s.line}: '{s.kind}' stands outside of a loop: which statements it leaves out is lost where "
                     "the loop has been written out"

@@ -10,13 +10,30 @@ import sympy
 from ..base.errors import ModelError
 from ..write.symbols import VariableSymbol, der
 from . import tree
-from .builtin import FUNCTIONS, applied, matrix_product, numbers_checked
+from .builtin import FUNCTIONS, applied, matrix_power, matrix_product, numbers_checked, rows_joined
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
-from .read_base import FUNCTION
+from .read_expressions import FUNCTION
 from .values import Record, Results, Value, both, chosen, either, entrywise, is_condition, negated
 
 Names = Callable[[str], Value]  # the value of a name; raises KeyError for an unknown one
+
+
+class Quieted:
+    """Conditions that stand in noEvent everywhere. One that stands elsewhere, too, is an event there."""
+
+    def __init__(self):
+        self.within: set[Value] = set()
+        self.elsewhere: set[Value] = set()
+
+    def __contains__(self, condition: object) -> bool:
+        return condition in self.within and condition not in self.elsewhere
+
+    def __iter__(self) -> Iterator[Value]:
+        return iter(self.within - self.elsewhere)
+
+    def __len__(self) -> int:
+        return len(self.within - self.elsewhere)
 
 
 class Evaluator:
@@ -46,7 +63,7 @@ class Evaluator:
         self.special, self.externals = special, externals
         self.literals = literal_numbers(classes)
         self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
-        self.quieted: set[sympy.Basic] = set()  # conditions that stood in noEvent
+        self.quieted = Quieted()
         self.named, self.opaque = named, opaque
         self.depth = 0
         self.guards: list[Value] = []  # conditions that are not constant, around what is carried out
@@ -128,6 +145,7 @@ class Evaluator:
 
     def _by_choice(self, value: list, index: Value, rest: tuple, names: Names) -> Value:
         """The entry of an array whose subscript is not constant."""
+        # The last entry needs no condition: a subscript outside of the array means nothing.
         entries = [self._entry(row, rest, names) for row in value]
         out = entries[-1]
         for k in range(len(entries) - 1, 0, -1):
@@ -142,14 +160,21 @@ class Evaluator:
         sign = e.operator
         if sign in ("and", "or"):
             a = self.evaluate(e.left, names)
+            # The right side may have no value, as the entry of an array of size zero behind "n > 0 and".
             if isinstance(a, bool) and a == (sign == "or"):
                 return a
             return entrywise(both if sign == "and" else either, a, self.evaluate(e.right, names))
         a, b = self.evaluate(e.left, names), self.evaluate(e.right, names)
         if sign in RELATIONS:
-            return RELATIONS[sign](a, b) if sign in ("==", "<>") else RELATIONS[sign](*map(self._compared, (a, b)))
+            sides = (a, b) if sign in ("==", "<>") else map(self._compared, (a, b))
+            found = RELATIONS[sign](*sides)
+            if not self.quiet:
+                self.quieted.elsewhere.add(found)
+            return found
         if sign == "*" and isinstance(a, list) and isinstance(b, list):
             return matrix_product(a, b)
+        if sign == "^" and isinstance(a, list):
+            return matrix_power(a, b)
         if sign == "+" and isinstance(a, str):
             return a + str(b)
         if sign in ("/", "./") and self.guards and isinstance(b, int | float) and b == 0:
@@ -177,6 +202,7 @@ class Evaluator:
             if holds is True:
                 pairs.append((True, self.evaluate(value, names)))
                 break
+            # What is named inside holds under this condition only.
             self.guards.append(holds)
             pairs.append((holds, self.evaluate(value, names)))
             self.guards[-1] = negated(holds)
@@ -189,9 +215,13 @@ class Evaluator:
         return out
 
     def _comprehension(self, e: tree.Comprehension, names: Names) -> list:
-        (name, over), *rest = e.iterators
+        # `{f(i, j) for i in a, j in b}` is `{{f(i, j) for i in a} for j in b}`: the last iterator counts the rows
+        # (Modelica Language Specification 3.6, section 10.4.1.1).
+        *rest, (name, over) = e.iterators
         values = self._range_of(over, names)
-        inner = tree.Comprehension(e.value, tuple(rest)) if rest else e.value
+        inner: tree.Expression = e.value
+        if rest:
+            inner = tree.Array((tree.Comprehension(e.value, tuple(rest)),))
         return [self.evaluate(inner, _with(names, name, v)) for v in values]
 
     def _range_of(self, e: tree.Expression | None, names: Names) -> list:
@@ -202,15 +232,13 @@ class Evaluator:
 
     def _range(self, e: tree.Range, names: Names) -> list:
         first, step, last = (self.constant(x, names) for x in (e.first, e.step, e.last))
+        if step == 0:
+            raise ModelError(f"the range {first}:0:{last} has no step")
         count = math.floor(round((last - first) / step, 6)) + 1  # rounding: 0.3 / 0.1 is below 3
         return [first + k * step for k in range(max(count, 0))]
 
     def _matrix(self, e: tree.Matrix, names: Names) -> list:
-        rows = []
-        for row in e.rows:
-            entries = [self.evaluate(x, names) for x in row]
-            rows.append([x for entry in entries for x in (entry if isinstance(entry, list) else [entry])])
-        return rows
+        return rows_joined([[self.evaluate(x, names) for x in row] for row in e.rows])
 
     def _part(self, e: tree.Part, names: Names) -> Value:
         whole = self.evaluate(e.whole, names)
@@ -239,6 +267,7 @@ class Evaluator:
         named = {k: self.evaluate(v, names) for k, v in e.named}
         if name in FUNCTIONS:
             return applied(name, arguments, named)
+        # A function that is an argument is called by the argument's name.
         if name not in self.classes and "." not in name:
             try:
                 return names(name)(*arguments, **named)
@@ -249,13 +278,14 @@ class Evaluator:
     def _without_events(self, e: tree.Call, names: Names) -> Value:
         if e.function == "smooth" and self.constant(e.arguments[0], names) == 0:
             return self.evaluate(e.arguments[1], names)  # continuous only: its kinks stay events
+        # Put back rather than set to False: `noEvent` may stand in another one.
         before, self.quiet = self.quiet, True
         try:
             value = self.evaluate(e.arguments[-1], names)
         finally:
             self.quiet = before
         if is_condition(value) and not isinstance(value, bool):
-            self.quieted.add(value)
+            self.quieted.within.add(value)
         return value
 
     def _applied(self, e: tree.Expression, names: Names) -> Value:

@@ -49,6 +49,7 @@ class FlatComponent(Component):
         self.flat = flat
         found = scope.definitions
         scope.declare_variables()
+        # Before anything is written, so that an equation with a law in its place is left out.
         replaced = {variable: equation_of(scope, variable) for variable in flat.laws}
         equations = [s for s in found.equations if not any(s is r.statement for r in replaced.values())]
         equations = with_chains_solved(equations, scope.interpreter.name_of)
@@ -59,6 +60,7 @@ class FlatComponent(Component):
             located(flat.name, s.line, read_when, scope, s)
         for section in found.sections:
             located(flat.name, section[0].line, read_section, scope, section)
+        # After all whens, and before equations: these read relations by the truths that whens keep.
         discrete.share_relations()
         for write, statements in (
             (write_equation, equations),
@@ -80,6 +82,7 @@ class FlatComponent(Component):
                 self.output(output, as_number(scope.value(output)))
         discrete.write()
 
+    # Names of a flat text have dots and brackets, which those of other components must not have.
     def _claim(self, name: str, what: str):
         self._check_open(f"declare its {what} '{name}'")
         if name in self.variables or name in self.parameters:

@@ -6,7 +6,7 @@ from typing import Any
 
 from ..base.errors import ModelError
 from .learned_law import Law, law_of
-from .read_base import INSIDE, written
+from .read_expressions import INSIDE, written
 from .tree import Class, Number, Reference
 
 PREFERRED = ("StateSelect.prefer", "StateSelect.always")

@@ -96,6 +96,7 @@ class FrontEnd:
 
     def _opened(self) -> Any:
         if self.session is None:
+            # rumoca asks for the folder that holds that of a library.
             folders = [root.parent if (root / "package.mo").exists() else root for root in self.roots]
             if any(f.is_dir() for f in folders):
                 copies = Path(tempfile.mkdtemp(prefix="modelica-"))
@@ -121,9 +122,11 @@ class FrontEnd:
             return broken
         error = error.partition("\nRelated failures")[0]
         error = re.sub(rf"\b{re.escape(model)}\b(?! =)", called, error) if model and called else error
+        # A syntax error has a place in the text, which the error of the flattening does not say.
         wrong = [d.message for d in self.rumoca.validate_source(text, model=model) if d.rule == "syntax-error"]
         if place := _PLACE.search("\n".join(wrong)):
             return f"Modelica, line {place['line']}, column {place['column']}: {place['what'].strip()}"
+        # A type that is not found explains other names that are not: it is said first.
         unresolved = sorted(
             (m.groups() for m in _UNRESOLVED.finditer(error)), key=lambda each: each[0] != "type reference"
         )

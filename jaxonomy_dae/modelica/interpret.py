@@ -216,6 +216,7 @@ class Interpreter(Evaluator):
                 return
             rest = s._replace(branches=s.branches[k + 1 :])
             results = []
+            # The branches that remain are an `if` of their own, so that only two are joined at a time.
             for condition, statements in ((holds, body), (negated(holds), (rest,))):
                 copied = dict(local)
                 self.guards.append(condition)
@@ -255,6 +256,7 @@ class Interpreter(Evaluator):
         state = carried(list(dict.fromkeys(changed)), local)
         inside = dict(local)
         placed([(c.path, c.value) for c in state if c.before is not None], inside)
+        # Names would be equations of the model, outside of the loop, where what a round reads has no value.
         named, guards, self.named, self.guards = self.named, self.guards, lambda e: e, []
         try:
             within = local_names(inside, names)
@@ -273,6 +275,7 @@ class Interpreter(Evaluator):
 
     def _rounds(self, iterators: tuple, body: tuple, local: dict[str, Value], names: Names) -> None:
         (name, over), *rest = iterators
+        # The iterator of a loop hides a variable of its name, which is as it was afterwards.
         was_there, shadowed = name in local, local.get(name)
         for value in self._range_of(over, names):
             if local.get("return") is True or local.get("break") is True:

@@ -4,8 +4,15 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import tempfile
 from pathlib import Path
+
+from ..host.kept import make_room
+
+
+OURS = re.compile(r"[0-9a-f]{64}(\.gz)?|new-[\w-]+")  # names of files that this module wrote
+ROOM = 2**28  # bytes in one folder: the 1,343 classes of the Modelica library take some 15 MB
 
 
 def contents(root: Path, folder: Path) -> str:
@@ -17,6 +24,7 @@ def contents(root: Path, folder: Path) -> str:
         return known.read_text()
     digest = hashlib.sha256()
     for f in files:
+        # Names from the root on: a library that was moved or copied is the same.
         digest.update(f"{f.relative_to(root.parent)} {f.stat().st_size}\n".encode() + f.read_bytes())
     write(known, digest.hexdigest().encode())
     return digest.hexdigest()
@@ -29,3 +37,4 @@ def write(path: Path, content: bytes) -> None:
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix="new-", delete=False) as new:
             new.write(content)
         os.replace(new.name, path)
+        make_room(path.parent, OURS, ROOM)

@@ -36,6 +36,7 @@ class LearnedLaw:
 def _read(m: Component, written: Value) -> list[VariableSymbol]:
     """The variables that an expression reads, in the order of their declaration."""
     symbols = written.free_symbols if isinstance(written, sympy.Basic) else set()
+    # In the order of declaration: a set's order differs between processes, and trained weights belong to places.
     order = list(m.variables)
     return sorted((s for s in symbols if isinstance(s, VariableSymbol)), key=lambda s: (order.index(s.path), s.order))
 

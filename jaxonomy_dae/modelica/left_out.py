@@ -28,6 +28,7 @@ def _length(v: list) -> Value:
 def _normalized(v: list, eps: float = 100 * sys.float_info.epsilon) -> Value:
     """The unit vector along `v`; a vector below `eps` is divided by `eps`."""
     size = _length(v)
+    # Quiet, as everything inside of a function: there relations are no events.
     divisor = chosen(RELATIONS[">="](size, eps), size, eps, quiet=True)
     return entrywise(lambda x: ARITHMETIC["/"](x, divisor), v)
 

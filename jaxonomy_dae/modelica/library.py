@@ -90,6 +90,7 @@ class Library:
             raise ModelError(f"there is no class '{name}' in {self.shelf}: {nearest(name, packed)}")
         if source is None:
             self._check_known(name)
+        # Records are read from the sources only if the front end misses equations: it takes a search through files.
         try:
             return opened(
                 name, flattened(self.front_end, name, changes, source, functools.partial(self._records, name, source))

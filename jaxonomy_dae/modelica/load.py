@@ -46,6 +46,7 @@ def load(source: str | Path, model: str | None = None, roots: Sequence[str | Pat
     if model is None and (is_base or not roots) and not is_modelica:
         flat = flat_of(read_base(text))
         return completed(flat, Sources(roots), DEFINED) if roots else flat
+    # rumoca reads a file itself; one that begins with what it does not read is given as a text.
     return _by_rumoca(text, None if is_text or text != written else Path(source), model, roots)
 
 

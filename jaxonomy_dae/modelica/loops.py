@@ -94,6 +94,7 @@ def repeated(condition: Value, state: Sequence[Carried], after: Sequence[Value])
             raise ModelError(f"a while loop changes '{c.path[0]}', which is not made of numbers: got {value!r}")
     own = [c.symbol for c in state]
     expressions = [sympy.sympify(as_number(v)) for v in (condition, *after)]
+    # Sorted: the order of a set differs from process to process, and that of arguments would, too.
     others = sorted({s for e in expressions for s in symbols_of(e)} - set(own), key=str)
     labels = [str(s) for s in (*others, *own)]
     kernel = Kernel([read(e, str) for e in expressions], labels)
@@ -107,6 +108,7 @@ def repeated(condition: Value, state: Sequence[Carried], after: Sequence[Value])
             goes_on, *new = kernel([*fixed, *values])
             return jnp.asarray(goes_on) > 0.5, jnp.stack([jnp.asarray(v, start.dtype) for v in new])
 
+        # Bounded: reverse mode must go back over the rounds, which it cannot where their number has no limit.
         end = private("while_loop")(
             lambda values: one(values)[0], lambda values: one(values)[1], start, max_steps=MOST, kind="bounded"
         )

@@ -105,6 +105,7 @@ def changed_text(sources: Sources, text: str, change: Callable[[Found, Mark], It
         of = found[mark.path]
         if of is not None and of.source.kind not in ("function", "record", "type", "operator"):
             changes += change(of, mark)
+    # From the end of the text, so that the places of changes before stay valid.
     for begin, end, new in sorted(changes, reverse=True):
         text = text[:begin] + new + "\n" * (text.count("\n", begin, end) - new.count("\n")) + text[end:]
     return text

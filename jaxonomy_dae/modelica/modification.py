@@ -17,8 +17,16 @@ def modification(texts: tuple[str, ...], values: Mapping[str, Any]) -> str:
         inside = nested
         for part in outer:
             inside = inside.setdefault(part, {})
+            if not isinstance(inside, dict):
+                raise _both_given(name)
+        if last in inside:
+            raise _both_given(name)
         inside[last] = value
     return ", ".join([*texts, *_each(nested)])
+
+
+def _both_given(name: str) -> ModelError:
+    return ModelError(f"the modification '{name}' and another one modify the same: give either the whole or its parts")
 
 
 def _each(values: Mapping[str, Any]) -> list[str]:

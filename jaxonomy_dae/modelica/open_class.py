@@ -79,6 +79,7 @@ def opened(name: str, closed: Closed) -> OpenClass:
     if found.flat.get("is_partial"):
         raise ModelError(f"'{name}' is partial: open a class that extends it, or write one as source=…")
     ports = tuple(p for top in found.flat["top_level_connectors"] for p in _ports(name, top, found.flat["variables"]))
+    # A connector with streams was connected to a boundary, and has no equation that closes it.
     flows = [f"{port.name}.{flow}" for port in ports for flow, _ in port.flows if not port.streams]
     flat = with_external_objects(read_open(found.dae, name.rpartition(".")[2], flows), found.flat)
     flat = without_boundaries(flat, closed.outer)
@@ -177,6 +178,7 @@ def _ports(name: str, top: str, variables: Mapping[str, Json]) -> Iterator[OpenP
             kind = next((k for k in ("flow", "stream") if scalars[n][k]), "potential")
             sides[kind].append((n[len(prefix) + 1 :], scalars[n].get("unit") or ""))
         orientation = tuple(n[len(prefix) + 1 :] for n in members if scalars[n]["is_overconstrained"])
+        # The rotation of a frame has three degrees of freedom, and three torques, however many numbers say it.
         freedom = len(sides["potential"]) - len(orientation) + (3 if is_frame(orientation) else 0)
         if freedom != len(sides["flow"]):
             counts = f"{len(sides['potential'])} potentials and {len(sides['flow'])} flows"

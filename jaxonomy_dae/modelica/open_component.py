@@ -44,6 +44,7 @@ class OpenComponent(FlatComponent):
         self, ev: EqnEnv, name: str, /, *, start: Mapping[str, Any] | None = None, numbers: Sequence[str] = (),
         **parameters: Any,
     ):  # fmt: skip
+        # Not the constructor of `FlatComponent`, which would write the equations before there are ports.
         Component.__init__(self, ev, name)
         of = self.opened
         where = f"{of.name} '{name}'"
@@ -75,6 +76,7 @@ class OpenComponent(FlatComponent):
         flat = type(flat)(model, flat.classes)
         signals = {n for n in of.inputs if types[n] != "Real"}
         scope = Scope(flat, self, _numbers(of, numbers, where), given, signals)
+        # Starts refer to parameters that the text does not declare.
         scope.known |= {n: v for n, v in given.items() if n not in declared}
         self._write(flat, scope, discrete)
         self._show_ports()

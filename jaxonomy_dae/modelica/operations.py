@@ -18,6 +18,7 @@ def _equal(a: Value, b: Value) -> Value:
     for choice, number in ((a, b), (b, a)):
         if isinstance(choice, sympy.Piecewise) and isinstance(number, int | float):
             return _of_branches(choice, lambda v: _equal(v, number))  # noqa: B023
+    # SymPy decides what it can: equal expressions give a truth and no event.
     return plain(sympy.Eq(a, b))
 
 

@@ -94,6 +94,7 @@ def tried(library: Library, name: str) -> tuple[Row, OpenClass | None]:
     values: dict[str, Any] = dict.fromkeys(found.required, 1.0)
     try:
         component_of(found)(EqnEnv(), "x", **values)
+    # A library is packed as far as it goes: one class that fails is a row of the table.
     except (ModelError, ValueError, TypeError, RecursionError) as error:
         return Row(name, "opened", *counts, " ".join(str(error).split())), found
     return Row(name, "translated", *counts), found

@@ -16,6 +16,7 @@ def domain_of(port: OpenPort) -> Domain:
         return _named(port)
     for domain in (Electrical, Translational, Rotational, Thermal, Hydraulic):
         pairs = zip((*domain.across, *domain.through), (*port.potentials, *port.flows), strict=False)
+        # A connector without units counts by its names.
         if len(port.potentials) == len(domain.across) and all(
             ours == theirs and _unit(there) in ("", here) for (ours, here), (theirs, there) in pairs
         ):

@@ -72,6 +72,7 @@ class _Reader:
         if not self.flows:
             return ops
         closed = [self._set_to_zero(op) for op in ops]
+        # Flows of an array of connectors are closed by one equation for all, under the name of the array.
         owner = {flow: flow if flow in closed else re.sub(r"\[[\d,]*\]$", "", flow) for flow in sorted(self.flows)}
         for flow, name in owner.items():
             if closed.count(name) != 1:
@@ -238,6 +239,7 @@ class _Reader:
                     target, value = self.of.variable(d["target"]["variable"]), self.of.expression(d["value"], {})
                     yield target.path, step["trigger"], step["guard"], tree.Assignment(target, value, line)
         for activation, target, where, e in self._of_discrete():
+            # Variables of an algorithm stand here, too, without the order of its steps.
             if activation != "always" and target not in in_steps:
                 yield target, *self._when(activation, where), e
         for action in s["event_actions"]:

@@ -52,6 +52,7 @@ def _kept(root: Path, sources: Sources) -> dict[str, str]:
     folder = folder_of("modelica")
     if folder is None:
         return dict(_changed(root, sources))
+    # All roots count, since types of a file may be defined in another library.
     told = json.dumps([_FORMAT, [contents(r, folder) for r in sources.roots], str(root)])
     path = folder / "readable" / f"{hashlib.sha256(told.encode()).hexdigest()}.gz"
     with contextlib.suppress(OSError, EOFError, ValueError):

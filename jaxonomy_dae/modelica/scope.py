@@ -79,6 +79,7 @@ class Scope:
         self.kept = self.discrete.kept
         self.as_numbers = False
         self.final: dict[str, Value] = {}
+        # Only now: sizes may depend on parameters, records and functions, which the interpreter finds by their names.
         self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
         self.declared = {d.name: d for d in flat.model.declarations}
         entries, fields = _gather(self.declared)
@@ -239,6 +240,8 @@ class Scope:
             raise ModelError(f"line {d.line}: nothing determines '{d.name}': it has neither an equation nor a when")
         if found is None:  # an input of the model that nothing drives
             start = self._start(d.modifiers.get("start")) or self._least(d.type)
+            if isinstance(start, sympy.Expr):
+                raise ModelError(f"line {d.line}: the start of '{d.name}', an input that nothing drives, is a number")
             return bool(start) if self.kind(d.type) == "Boolean" else int(start)
         return self.defined(d.name, found)
 
@@ -292,6 +295,7 @@ class Scope:
                 if isinstance(s.left, Reference) and s.left.path == name and not any(s.left.subscripts):
                     try:
                         return self.interpreter.evaluate(s.right, self._at_start)
+                    # Such as one that depends on itself through another parameter: then both are found by solving.
                     except ModelError:
                         return None
         return None
@@ -327,6 +331,7 @@ class Scope:
             )
         nominal = self._start(d.modifiers.get("nominal"))
         start = self._start(d.modifiers.get("start"))
+        # An input of a part is bound to what drives it, and is an ordinary variable.
         if "input" in d.prefixes and d.value is None:
             return self.component.input(d.name, default=None if start is None else float(start), unit=self._unit(d))
         fixed = d.modifiers.get("fixed") == Truth(True)
@@ -336,6 +341,7 @@ class Scope:
             self.definitions.equations.append(Equality(Reference((d.name,)), d.value, d.line))
         return self.component.variable(
             d.name, start=start, fixed=fixed, unit=self._unit(d),
+            # A nominal value of zero, or in parameters, says nothing of a size that is known now.
             nominal=abs(nominal) if isinstance(nominal, int | float) and nominal else None,
         )  # fmt: skip
 
@@ -391,9 +397,11 @@ class Scope:
         outside = table.outside(u) if isinstance(u, sympy.Expr) else False
         outside = functools.reduce(both, self.interpreter.guards, outside)
         if not isinstance(outside, bool) and outside not in self.ends and outside.atoms(VariableSymbol, TimeSymbol):
+            # One event for each condition, however many columns of a table are read.
             self.ends.add(outside)
             first, last = table.rows[0, 0] + table.shift, table.rows[-1, 0] + table.shift
-            told = f"a table is read outside of [{first:g}, {last:g}], without extrapolation"
+            inside = ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in (first, last))
+            told = f"a table is read outside of [{inside}], without extrapolation"
             self.component.when(self.kept.in_discrete(outside), terminate(told), at_start=True)
         return read(table, column, u, *more)
 

@@ -42,6 +42,7 @@ def with_chains_solved(equations: Sequence[Statement], name_of: Callable[[Refere
         (y_root, y_sign), (x_root, x_sign) = aliases.of(y), aliases.of(x)
         first, second = (a, b) if x_sign > 0 else (b, a)
         link = _Link(place, s, y, x, x_sign > 0, first, second)
+        # y = semiLinear(x, a, b) is -y = semiLinear(-x, b, a): links differ by the product of both signs alone.
         groups[y_root, x_root, x_sign * y_sign].append(link)
     out = list(equations)
     for links in groups.values():

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,9 @@ class Shelf:
         path = self._path(name, changes, source)
         if path is None:
             return None
-        with contextlib.suppress(OSError, EOFError, ValueError, ModelError):  # none, or not whole: flattened anew
+        with contextlib.suppress(
+            OSError, EOFError, ValueError, zlib.error, ModelError
+        ):  # none, or not whole: flattened anew
             found = read(json.loads(gzip.decompress(path.read_bytes())))
             os.utime(path)
             return found

@@ -105,6 +105,8 @@ class Sources:
         key = name, *(s.key for s in scopes)
         if key in self.looked_up:
             return self.looked_up[key]
+        # Within another search, classes that are being searched are passed over: its answer may lack something, and is
+        # not kept.
         complete = not self.busy
         found = self._lookup(name, scopes)
         if complete:
@@ -114,6 +116,7 @@ class Sources:
     def _lookup(self, name: str, scopes: Sequence[Found]) -> tuple[Member, list[str]] | None:
         first, *rest = name.split(".")
         for scope in scopes:
+            # What is declared or inherited hides what is imported (section 5.3.1).
             found = self.member(scope, first) or self._imported(scope, first)
             if found is not None:
                 break
@@ -245,9 +248,11 @@ class Sources:
         return None
 
     def _imported(self, scope: Found, name: str) -> Member | None:
+        # A qualified import comes before what a whole package brings (section 5.3.1).
+        qualified = next((full for local, full in scope.source.imports if local == name), None)
+        if qualified is not None:
+            return self.find(qualified)
         for local, full in scope.source.imports:
-            if local == name:
-                return self.find(full)
             if local == "*":
                 package = self.find(full)
                 found = self.member(package, name) if isinstance(package, Found) else None
@@ -267,6 +272,7 @@ class Sources:
     def _file_of(self, name: str) -> Found | None:
         for root in self.roots:
             places = [root / name / "package.mo", root / f"{name}.mo"]
+            # Folders of libraries may carry a version, as "Modelica 4.1.0" does.
             places += [root / "package.mo"] if root.name.split(" ")[0] == name else []
             places += [root] if root.stem == name and root.suffix == ".mo" else []
             for file in places:

@@ -87,6 +87,7 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
             if a.order:
                 c.start(a, b, fixed=True)
                 return
+            # The first such equation is a start. A second one says something about another variable.
             variable = c.variables[a.path]
             if not variable.fixed:
                 c.variables[a.path] = dataclasses.replace(variable, start=sympy.sympify(b), fixed=True)

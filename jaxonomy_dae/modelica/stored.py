@@ -61,6 +61,7 @@ def _port(data: list[Any]) -> OpenPort:
 
 
 def _written(x: Any) -> Any:
+    # Nodes of the tree are tuples themselves, and so come first.
     if type(x).__name__ in _NODES:
         return [type(x).__name__, *map(_written, x)]
     if isinstance(x, tuple | list):

@@ -53,6 +53,7 @@ class Table:
         y = self.rows[:, int(self.columns[int(column) - 1]) - 1]
         if len(x) == 1:
             return _plain(y[0])
+        # Where entries are parameters no interval is known now: even a number is looked up by a choice.
         if self.rows.dtype == object:
             if self.smoothness not in (LINEAR, CONSTANT):
                 raise ModelError("the entries of a smooth table are numbers")

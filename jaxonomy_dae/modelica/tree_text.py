@@ -4,7 +4,7 @@ import re
 
 from ..base.errors import ModelError
 from . import tree
-from .read_base import FUNCTION
+from .read_expressions import FUNCTION
 
 _PLAIN = re.compile(r"[A-Za-z_]\w*\Z")
 
@@ -17,6 +17,7 @@ def text_of(e: tree.Expression | None) -> str:
     - `ModelError` for parts that have no text: several results, fields and entries of what is not a reference.
     """
     if isinstance(e, tree.Number):
+        # In parentheses, as two signs must not follow each other.
         return f"({e.value!r})" if e.value < 0 else repr(e.value)
     if isinstance(e, tree.Truth):
         return "true" if e.truth else "false"

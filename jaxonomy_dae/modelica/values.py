@@ -72,6 +72,7 @@ def chosen(condition: Value, a: Value, b: Value, quiet: bool = False) -> Value:
     condition = as_condition(condition)
     if isinstance(condition, bool):
         return a if condition else b
+    # By type, too: 1, 1.0 and True are equal in Python.
     if a is b or (type(a) is type(b) and a == b):
         return a
     if isinstance(a, list) or isinstance(b, list):

@@ -81,6 +81,7 @@ class _Algorithm:
 
     def carry_out_when(self, s: tree.Branches) -> None:
         acting = self.scope.discrete.branches([list(_conditions(self.scope, c, self.names)) for c, _ in s.branches])
+        # Each branch begins with the values before the `when`: only one of them acts.
         before, results = dict(self.local), []
         for acts, (_, body) in zip(acting, s.branches, strict=True):
             self.local = dict(before)
@@ -147,6 +148,7 @@ def _first(cases: list[tuple[Value, Value]], otherwise: Value) -> Value:
 
 def _each_action(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tuple[Target, Value]]:
     """Pairs (variable, new value); a text for `terminate`."""
+    # What assigns one after another is carried out as a whole; what acts otherwise stands by itself.
     if any(isinstance(s, tree.Assignment | tree.Loop) for s in body):
         yield from _of_loops(scope, tuple(s for s in body if not isinstance(s, tree.Effect)))
         body = tuple(s for s in body if isinstance(s, tree.Effect))

@@ -25,6 +25,7 @@ class Certificate:
     @property
     def holds(self) -> bool:
         """True if the error is finite and not above the limit."""
+        # A comparison with NaN is false, and so is its negation: an error that is not a number must fail.
         return math.isfinite(self.error) and self.error <= self.allowed
 
     def __repr__(self):

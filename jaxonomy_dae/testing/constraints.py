@@ -48,10 +48,12 @@ def assert_constraints(solution: Solution, rtol: float = 1e-6, atol: float = 1e-
     claim = "the saved states satisfy the constraints of the model"
     names = [*system.states, *system.carried]
     constraints = system.report.constraints
+    # A check of nothing says so, rather than pass without a word.
     if not system.is_constrained or not len(states):
         return Certificate(claim, "nothing: the model has no hidden constraints", 0.0, 1.0, "")
     moves = np.abs(np.asarray(_moves(system, solution.ts, solution.states, solution.inputs, solution.discrete), float))
     allowed = atol * np.asarray(system.plan.nominal, float) + rtol * np.abs(states).max(axis=0)
+    # A singular Jacobian of constraints gives steps that are no numbers, and must not pass.
     error = np.where(np.isfinite(moves), moves / allowed, np.inf)
     row, column = np.unravel_index(np.argmax(error), error.shape)
     found = [f"hidden constraint: {text}" for text in constraints[:4]]

@@ -28,6 +28,7 @@ def assert_energy_balance(solution: Solution, rtol: float = 1e-4) -> Certificate
         nothing.
     - `ModelError` as `Solution.energy_balance_error`.
     """
+    # The second run is far more exact than any `rtol` that is asked for: what is left is the error of the accounts.
     found = energy_balance(solution, 1e-8, 1e-10)
     k = int(np.argmax(np.abs(found.error)))
     silent = list(silent_components(solution.system.plan))

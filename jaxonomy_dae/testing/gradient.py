@@ -69,6 +69,7 @@ def assert_gradient(
 
     size = jax.eval_shape(flat, x).shape[0]
     rng = np.random.default_rng(seed)
+    # Of several outputs one number is made. Signs, not normal numbers, so that none is nearly left out.
     weights = jnp.asarray(rng.choice([-1.0, 1.0], size) if size > 1 else np.ones(size), x.dtype)
 
     def value(x: Array) -> Array:
@@ -86,8 +87,10 @@ def assert_gradient(
         raise AssertionError(
             f"the derivative by {labels[k]} is not finite: {backwards[k]} backwards, {forwards[k]} forwards"
         )
+    # Relative to the largest of all directions: a derivative that is zero has no digits of its own to agree in.
     scale = max(float(np.abs(a).max()) for a in (backwards, forwards, differences))
     scale = scale if scale > 0 else 1.0
+    # Differences that are worse than what they should tell prove nothing: to pass would be to pass anything.
     blind = errors > rtol * scale
     if blind.any() or not np.isfinite(differences).all():
         k = int(np.argmax(np.where(np.isfinite(errors), errors, np.inf)))
@@ -129,6 +132,7 @@ def _directions(moving: PyTree, x: np.ndarray, count: int, rng: np.random.Genera
     size = np.concatenate(sizes)
     if len(x) <= EACH:
         return np.diag(size), names
+    # Of unit length on average, so that a step moves the numbers together as far as one of them alone.
     drawn = rng.standard_normal((count, len(x))) / np.sqrt(len(x))
     return drawn * size, [f"direction {k}" for k in range(count)]
 
@@ -157,6 +161,7 @@ def _difference(value: Callable[[float], float]) -> tuple[float, float]:
 
 def _extrapolated(value: Callable[[float], float], step: float) -> tuple[float, float]:
     """(derivative, estimate of its error) by Richardson extrapolation of central differences at shrinking steps."""
+    # A large step may leave the domain of a root or logarithm.
     while not np.isfinite(value(step) - value(-step)):
         step /= 10
         if step < 1e-9:
@@ -165,9 +170,11 @@ def _extrapolated(value: Callable[[float], float], step: float) -> tuple[float, 
     for level in range(LEVELS):
         row = [(value(step) - value(-step)) / (2 * step)]
         for k, previous in enumerate(above):
+            # Errors of central differences have even powers of the step only.
             factor = SHRINK ** (2 * (k + 1))
             row.append((factor * row[k] - previous) / (factor - 1))
             change = max(abs(row[-1] - row[-2]), abs(row[-1] - previous))
+            # Ridders: the entry that differs least from its two neighbours in the tableau is the best one.
             if change <= error:
                 best, error = row[-1], change
         if level and abs(row[-1] - above[-1]) >= WORSE * error:

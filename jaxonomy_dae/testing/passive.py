@@ -76,7 +76,9 @@ def assert_passive(
             raise AssertionError(f"the law has no finite value at u = {bad}: give smaller inputs= if none are as large")
         order = np.argsort(-found)
         value, u = float(found[order[0]]), samples[order[0]]
+        # Only if samples have found nothing, and for the weights given: each climb is a minimization of its own.
         if k == 0 and value <= allowed:
+            # By both measures: the share finds where losses nearly vanish, the rate where a law is strongest.
             highest = np.argsort(-np.asarray(rate(jnp.asarray(samples, dtype)), float))
             reached = [_climb(slope, samples[n], dtype) for n in (*order[:CLIMBS], *highest[:CLIMBS])]
             shares = np.asarray(gained(here, jnp.asarray(np.array(reached), dtype)), float)
@@ -126,11 +128,13 @@ def _typical(law: Callable, size: int | None, inputs: object) -> tuple[np.ndarra
 
 def _samples(rng: np.random.Generator, count: int, typical: np.ndarray) -> np.ndarray:
     """Inputs of all directions and sizes; a tenth of them has single entries at zero."""
+    # Normal entries have no preferred direction.
     directions = rng.standard_normal((count, len(typical)))
     sizes = 10.0 ** rng.uniform(-DECADES, DECADES, (count, 1))
     found = directions / np.linalg.norm(directions, axis=1, keepdims=True) * sizes * typical
     half = count // 2  # of these, each entry has a size of its own
     found[:half] = np.sign(directions[:half]) * typical * 10.0 ** rng.uniform(-DECADES, DECADES, (half, len(typical)))
+    # A law may be wrong only where one of its inputs rests.
     if len(typical) > 1:
         found[np.arange(0, count, 10), rng.integers(len(typical), size=len(found[::10]))] = 0.0
     return found
@@ -164,12 +168,14 @@ def _drawn(arrays: PyTree, rng: np.random.Generator) -> PyTree:
 
 def _climb(slope: Callable, start: np.ndarray, dtype: DTypeLike) -> np.ndarray:
     """Follows the rate to a local maximum, from a start point and in units of it."""
+    # In units of the start, of which entries may be six decades apart: L-BFGS-B assumes that all are alike.
     unit = np.where(start != 0, np.abs(start), np.abs(start).max() or 1.0)
     size = abs(float(slope(jnp.asarray(start / unit, dtype), jnp.asarray(unit, dtype))[0])) or 1.0
 
     def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = slope(jnp.asarray(z, dtype), jnp.asarray(unit, dtype))
         value, gradient = float(value) / size, np.asarray(gradient, float) / size
+        # A high cost, not NaN, which would end the line search.
         return (value, gradient) if np.isfinite(value) and np.isfinite(gradient).all() else (1e10, np.zeros_like(z))
 
     found = scipy.optimize.minimize(cost, start / unit, jac=True, method="L-BFGS-B", options={"maxiter": 30})

@@ -124,6 +124,8 @@ class ComponentArray:
             raise ModelError(f"array '{self.path}' has shape {self.numbers.shape}: {error}") from None
 
     def __getattr__(self, name: str) -> Any:
+        # `copy` and `pickle` ask an object for private names before it has attributes: `self.inner` would call this
+        # method again.
         if name.startswith("_"):
             raise AttributeError(name)
         inner = self.inner
@@ -304,6 +306,7 @@ def _give_values(prototype: Prototype, values: dict[str, np.ndarray], shape: tup
     waiting = [(prototype, 1)]
     while waiting:
         component, depth = waiting.pop()
+        # A symbol gets one more `../` at each level that it is handed down (`symbols.seen_from_child`).
         symbols = {ParameterSymbol(f"{'../' * depth}{prototype.name}:{name}"): v for name, v in values.items()}
         read = [*component.equations, *(v.start for v in component.variables.values() if v.start is not None)]
         read += [p.value for p in component.parameters.values() if isinstance(p.value, sympy.Expr)]
@@ -316,6 +319,7 @@ def _give_values(prototype: Prototype, values: dict[str, np.ndarray], shape: tup
             if not isinstance(parameter.value, sympy.Expr) or not parameter.value.free_symbols <= set(symbols):
                 continue
             used = sorted(parameter.value.free_symbols, key=str)
+            # SciPy, too: NumPy has no error function, gamma function and the like.
             numbers = sympy.lambdify(used, parameter.value, ["scipy", "numpy"])(*(symbols[s] for s in used))  # type: ignore[index]
             numbers = np.broadcast_to(np.asarray(numbers, np.float64), (math.prod(shape),))
             for k, number in enumerate(numbers.tolist()):
@@ -326,6 +330,7 @@ def _give_values(prototype: Prototype, values: dict[str, np.ndarray], shape: tup
                         f"got {number:g}"
                     )
             component.parameters[parameter.name] = parameter.with_value(EachValue(numbers, prototype))
+            # Expressions that stay symbolic, because they read other parameters too, read an argument from here.
             if component is prototype and len(used) == 1 and parameter.value is used[0]:
                 arguments[str(used[0]).rpartition(":")[2]] = parameter.name
         for child in component.children.values():

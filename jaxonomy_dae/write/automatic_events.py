@@ -224,6 +224,7 @@ class _Rewriting:
         if argument is live and not (turns and live in self.varying):
             return argument
         low, high = _DOMAINS.get(type(e), (0, None))
+        # Mirrored at zero, not cut off there, where a logarithm has no value and a root no slope.
         mirrored, outside = (-argument if low == 0 else sympy.Integer(low)), sympy.Lt(live, low)
         back: Expression = argument
         if high is not None:
@@ -442,6 +443,7 @@ def _vanish_on(surface: Expression, expressions_in: Callable[[Expression], tuple
             place, differences = {v: v - surface / slope}, expressions_in(v)
             if any(d.has(sympy.Derivative, sympy.Subs) for d in differences):
                 return False  # inside what jumps, which SymPy does not differentiate
+            # What `expand` does not see to be zero gets an event that it may not need: that costs a step, and is right.
             return all(sympy.expand(d.xreplace(place)) == 0 for d in differences)
     return False
 
@@ -509,6 +511,8 @@ def _needed_where(roots: Sequence[Expression], order: list[Expression]) -> dict[
     """The conditions under which the value of each part reaches an equation."""
     needed: dict[Expression, Needed] = {e: NEVER for e in order} | {root: ALWAYS for root in roots}
     for e in reversed(order):
+        # Outer parts first, in reverse order: where a part is needed is known when all that contain it have been
+        # passed.
         here = needed[e]
         if not isinstance(e, sympy.Piecewise):
             for a in _arguments(e):
@@ -517,6 +521,7 @@ def _needed_where(roots: Sequence[Expression], order: list[Expression]) -> dict[
         for branch, condition in _pairs(e):
             for a in (a for r in _sides_of(condition) for a in r.args):
                 needed[a] = union(needed[a], here)
+            # A branch is taken where its own condition holds and none before it does.
             taken = here
             if condition is not sympy.true:
                 taken, here = within(here, (condition, True)), within(here, (condition, False))

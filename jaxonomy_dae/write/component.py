@@ -155,6 +155,8 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
                 raise ModelError(
                     f"component '{self.name}' uses the name '{name}' twice: it is a {kind} already; rename the {what}"
                 )
+        # Ports and children are reached as attributes. A variable of such a name can still be read as
+        # `component["name"]`.
         if what in ("port", "child component") and hasattr(Component, name):
             raise ModelError(
                 f"component '{self.name}': a {what} cannot be named '{name}', because every component has an "
@@ -204,6 +206,7 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         if isinstance(value, sympy.Expr) and not value.is_number:
             self._check_parameters_only(value, f"the value of {where}")
         else:
+            # A discrete variable may start at True or False: conditions are assigned to it as 1 and 0.
             if kind == "parameter" and isinstance(value, bool | np.bool_):
                 raise ModelError(f"{where} must be a number; got {value}")
             value = real_number(
@@ -333,6 +336,7 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         """Declares a variable that equals `expr`, to be read in the solution."""
         self._claim(name, "output")
         symbol = self._declare(name, "output", unit=unit)
+        # Evaluated, `Eq` would try to decide whether the two are equal, and a long expression takes long.
         self.add_equations(sympy.Eq(symbol, expr, evaluate=False))
         return symbol
 
@@ -525,6 +529,7 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         return f"{type(self).__name__}({self.path!r})"
 
 
+# What `Component.__init__` sets. If one is missing, a subclass has not called it.
 _BASE_ATTRIBUTES = (
     *"ev name parent parameters variables ports children equations".split(),
     *"learned_terms connections signals events discrete_equations relations as_written held_branches".split(),

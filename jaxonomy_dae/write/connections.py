@@ -30,6 +30,7 @@ def resolve_ends(ends: Sequence[Any], where: str) -> tuple[Connection | None, li
     rest = list(ends)
     while rest:
         end = rest.pop(0)
+        # By its metaclass: `component` imports this module, which so cannot import `Component`.
         if isinstance(type(end), Construction) or isinstance(end, ComponentArray):
             if not rest or not isinstance(rest[0], str):
                 raise ModelError(f"{where}: connect(component, \"port\", …) needs a port name after '{end.path}'")

@@ -63,6 +63,7 @@ _ELSEWHERE = {
 def _hint(raised: Exception, name: str) -> str | None:
     """The probable mistake behind an error that does not name it, raised while the component `name` was built; None if
     it is not recognised."""
+    # Python and SymPy raise these as TypeErrors: their texts are all that tells one from another.
     error = str(raised)
     if isinstance(raised, SympifyError):
         return f"what stands in an equation is made of symbols and numbers. {SHADOWED}"

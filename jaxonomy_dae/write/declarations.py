@@ -10,11 +10,13 @@ import sympy
 from .interval import Interval
 from .symbols import TimeSymbol, VariableSymbol
 
+# Users' names contain no colon (`names.RESERVED`), so that internal names meet none of them.
 INITIALLY = ":initially"  # begins the names of what is zero at the initial time
 START = ":start"  # ends the name of what is declared by the start of a derivative
 Value: TypeAlias = float | int | sympy.Expr  # a number, or an expression in parameters
 
 
+# Compared by identity: arrays compare by entries, which is no truth.
 @dataclasses.dataclass(frozen=True, eq=False)
 class EachValue:
     """One value for each instance of an array, in the order of the instances."""

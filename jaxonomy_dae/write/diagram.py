@@ -101,6 +101,7 @@ class AcausalDiagram:
 
         - `ModelError` if a port does not exist or the ports are of different domains.
         """
+        # Now: a signal becomes a symbol, which does not tell the object that has it.
         for end in ends:
             if isinstance(end, Component):
                 self.add(_top(end))

@@ -100,6 +100,7 @@ class DiscreteDeclarations(RelationDeclarations):
                 found.reals.add(variable.path)
         before: dict[sympy.Basic, sympy.Basic] = {s: found.before(s.path) for s in sorted(read, key=str)}
         for variable, value in equations.items():
+            # Whole parts first: relations that contain them then compare variables.
             jumps = found.kept.with_jumps_as_variables(value.xreplace(before))
             found.give(variable.path, as_number(found.kept.in_discrete(jumps)), always=True)
         others = (DiscreteSymbol(s.path) for s in sorted(read, key=str))

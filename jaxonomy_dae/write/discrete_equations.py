@@ -211,6 +211,7 @@ class DiscreteEquations:
         starting, started = self.phase(STARTING), negated(self.phase(STARTING))
         initial = self.initial
         assert initial is not None
+        # What was before the initial time is the declared start of each variable.
         before = [Assign(self.before(m.path), m) for m in (*new, *self.remembered)]
         c._event(starting, (*before, Assign(initial, sympy.Integer(AT_FIRST))), None, solves, f"start of {names}")
         differs = [self._differs(m, n) for m, n in new.items()]
@@ -234,6 +235,7 @@ class DiscreteEquations:
             *(Assign(tick, _unless(pre(initial), pre(tick))) for tick in self.ticks.values()),
             Assign(initial, sympy.Integer(STARTED)),
         ]
+        # A run ends after the iteration whose body says so: first all other actions of it happen.
         ends = [(self.unshown(f":ends[{k}]", 0.0), text, when) for k, (when, text) in enumerate(self._ends)]
         actions += [Assign(done, as_number(when)) for done, _, when in ends]
         starts = [
@@ -300,6 +302,7 @@ def _check_order(definitions: dict[VariableSymbol, Expression], names: dict[Vari
     try:
         tuple(graphlib.TopologicalSorter(reads).static_order())
     except graphlib.CycleError as error:
+        # `graphlib` lists a circle from what is read to what reads it, and hidden variables have no name to be shown.
         circle = [names[s] for s in reversed(error.args[1]) if s in names]
         circle = circle if circle[:1] == circle[-1:] else [*circle, *circle[:1]]
         raise ModelError(

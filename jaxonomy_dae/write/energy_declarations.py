@@ -48,6 +48,7 @@ class EnergyDeclarations:
     def _declare_accounts(self, kind: str, expressions: tuple[object, ...]):
         self._check_open(f"declare its {kind}")
         for given in expressions:
+            # Not by `sympify`, which reads texts as SymPy's own names: "E" is 2.718 there.
             expression = self.symbol(given) if isinstance(given, str) else given
             if isinstance(given, int | float):
                 expression = sympy.sympify(given)

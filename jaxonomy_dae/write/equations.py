@@ -16,6 +16,7 @@ def zero_of(equation: object) -> sympy.Basic:
     return sympy.sympify(equation)
 
 
+# All instances of a class write the same equations (`symbols`): each is read once.
 @functools.lru_cache(maxsize=4096)
 def residual_of(equation: object) -> sympy.Expr:
     """Left side minus right side of an equation of a component.
@@ -36,6 +37,7 @@ def residual_of(equation: object) -> sympy.Expr:
     if not isinstance(residual, sympy.Expr):
         raise ModelError(f"{equation!r} is not an equation")
     atoms = atoms_of(residual)
+    # Symbols are real, so that only a coefficient can be complex.
     if sympy.I in atoms:
         raise ModelError(f"the equation {equation} has a complex coefficient: write its real and imaginary part as two")
     previous = sorted((s for s in atoms if isinstance(s, PreviousSymbol)), key=str)

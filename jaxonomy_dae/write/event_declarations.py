@@ -80,6 +80,7 @@ class EventDeclarations:
             if any(isinstance(s, DiscreteSymbol) for s in found.free_symbols):
                 raise ModelError(f"{where} must not change between events; it uses a discrete variable: {found}")
             parts.append(found)
+        # A period that follows parameters is checked when they have values.
         if parts[0].is_number and not float(parts[0]) > 0:
             raise ModelError(f"component '{self.name}': the period of sampled must be positive; got {parts[0]}")
         return Sampled(*parts)
@@ -199,6 +200,7 @@ class EventDeclarations:
 def _with_new_values(value: Expression, new: dict, above: tuple, where: str) -> Expression:
     """Substitutes the new values of discrete variables that the same event assigns. `above` are the symbols being
     substituted: a circle among them is refused."""
+    # Sets of symbols have another order in each process: the message is to be the same.
     read = sorted((s for s in value.free_symbols if s in new), key=str)
     for symbol in read:
         if symbol in above:

@@ -185,6 +185,8 @@ def guard_of(condition: Condition, where: str) -> sympy.Expr:
     if isinstance(condition, BooleanAtom | bool):
         raise ModelError(f"{where}: the condition is always {condition}: it contains no variable")
     if _is_discrete(condition):
+        # It has just two values: a condition that changes at events only is looked at after them, and no search is
+        # needed.
         return sympy.Piecewise((-1, condition), (1, True))
     if isinstance(condition, sympy.And | sympy.Or):
         # Relations in discrete variables alone switch the guard of the others on or off.
@@ -229,6 +231,7 @@ def is_strict(condition: Condition) -> bool:
 
 def while_on(guard: sympy.Expr, condition: Condition) -> sympy.Expr:
     """A guard that is there only while a condition in discrete variables holds."""
+    # Unevaluated: SymPy would multiply out branches that stand in conditions (`automatic_events.by_conditions`).
     return guard if condition is sympy.true else sympy.Piecewise((guard, condition), (1, True), evaluate=False)
 
 

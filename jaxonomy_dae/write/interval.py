@@ -62,12 +62,14 @@ def closed_ends(intervals: Sequence[Interval]) -> Float[np.ndarray, "n 2"]:
     distinct, which = distinct_intervals(intervals)
     ends = np.array([(i.low, i.high) for i in distinct], float).reshape(-1, 2)
     opened = np.array([(i.open_low, i.open_high) for i in distinct], bool).reshape(-1, 2)
+    # The nearest number inside an open end, so that searches can treat all ends as closed.
     inside = np.nextafter(ends, np.array([np.inf, -np.inf]))
     return np.where(opened, inside, ends)[which]
 
 
 def distinct_intervals(intervals: Sequence[Interval]) -> tuple[list[Interval], Int[np.ndarray, " n"]]:
     """The objects among intervals, of which arrays of components share a few, and which of them each is."""
+    # By identity: intervals hash field by field, which takes long for a million parameters.
     objects = {id(i): i for i in intervals}
     place = {key: k for k, key in enumerate(objects)}
     return list(objects.values()), np.array([place[key] for key in map(id, intervals)], np.int64)

@@ -71,6 +71,8 @@ class KeptRelations:
         return relation in self.forms or sympy.Not(relation) in self.forms
 
     def _form(self, relation: Condition) -> Condition:
+        # SymPy writes the negation of x < y as x ≥ y. One truth serves both, so that they cannot both hold, nor both
+        # fail.
         opposite = sympy.Not(relation)
         if opposite in self.forms:
             return sympy.Not(self.forms[opposite])

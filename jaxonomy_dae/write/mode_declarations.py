@@ -88,6 +88,7 @@ class ModeDeclarations(DiscreteDeclarations):
         tried = tuple((above, sympy.Eq(side, mode)) for mode in (_ON_IT, 1, _ABOVE_IS_TRIED))
         branch = sympy.Piecewise(*tried, (below, True))
         self._either(sympy.Eq(side, 0), surface, branch, 1, None)
+        # `part` is the a of a·above + (1 − a)·below = 0 in what holds the solution on the surface.
         rate, part = der(surface), below / (below - above)
 
         def moves(condition: Condition, mode: int, to: Value, flags: EventFlag = NO_FLAG) -> None:

@@ -23,6 +23,7 @@ def as_weights(theta: PyTree) -> PyTree:
 def count_outputs(network: Callable, inputs: int, where: str, theta: PyTree = None, noun: str = "network") -> int:
     """The number of outputs of `network(u)` or `network(t, u, theta)`, found without computing anything; `noun` is what
     errors call it."""
+    # Inputs in the precision of the weights, as when the model calls it: strict promotion refuses a mixture.
     dtypes = [leaf.dtype for leaf in jax.tree.leaves((network, theta)) if eqx.is_inexact_array(leaf)]
     dtype = dtypes[0] if dtypes else jnp.result_type(float)
     u = jax.ShapeDtypeStruct((inputs,), dtype)
@@ -31,6 +32,7 @@ def count_outputs(network: Callable, inputs: int, where: str, theta: PyTree = No
             out = eqx.filter_eval_shape(network, u)
         else:
             out = eqx.filter_eval_shape(network, jax.ShapeDtypeStruct((), dtype), u, theta)
+    # Whatever a user's function raises: its text is all that says what is wrong.
     except Exception as error:
         if noun == "function":
             why = why_untraceable(error, "its input" if inputs == 1 else f"its {inputs} inputs", "x")
@@ -110,6 +112,7 @@ class OneObject:
 
 
 def _compared_as_object(leaf: PyTree) -> PyTree:
+    # Methods are left: Python compares them by their object's identity and their function.
     own = callable(leaf) and not eqx.is_array(leaf) and type(leaf).__eq__ is not object.__eq__
     return OneObject(leaf) if own and not isinstance(leaf, types.MethodType) else leaf
 
@@ -117,6 +120,7 @@ def _compared_as_object(leaf: PyTree) -> PyTree:
 def uses_numpy(error: Exception) -> bool:
     """True if JAX raised the error because the function computes with NumPy or math."""
     numbers_wanted = jax.errors.TracerArrayConversionError | jax.errors.ConcretizationTypeError
+    # JAX's errors of truth values are a kind of ConcretizationTypeError, and have another remedy.
     return isinstance(error, numbers_wanted) and not isinstance(error, jax.errors.TracerBoolConversionError)
 
 

@@ -9,6 +9,7 @@ PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 def line_of_caller() -> str:
     """`models.py:57`, the innermost line outside of this package that leads here; `line 3` in a notebook or at a
     prompt; "" if there is none."""
+    # By frames, not by `inspect.stack`, which reads source files: a large model asks a hundred thousand times.
     frame = sys._getframe(1)
     while frame is not None:
         path = frame.f_code.co_filename

@@ -90,6 +90,7 @@ Planar = Domain(
 Hydraulic = Domain("Hydraulic", across=(("p", "Pa"),), through=(("m_flow", "kg/s"),))
 
 
+# For tests, which check types where they run.
 @runtime_checkable
 class Owner(Protocol):
     """A component, as its ports see it. Ports are parts of components, and so cannot import their class."""
@@ -119,6 +120,7 @@ class Port:
         self.name = name
         self.domain = domain
 
+    # Symbols are made when they are asked for: their path depends on which component is being written.
     def __getattr__(self, name: str):
         if name.startswith("__"):
             raise AttributeError(name)

@@ -22,6 +22,7 @@ def real_number(value: object, where: str, hint: str = "") -> float:
     """
     given: Any = value
     text = ""
+    # `float` would read texts of numbers, and NumPy would cut off imaginary parts with a warning.
     if isinstance(value, str):
         text = f"; got the string {value!r}" + (f": write {value} without quotes" if _is_numeral(value) else "")
     elif _is_complex(value):
@@ -30,6 +31,8 @@ def real_number(value: object, where: str, hint: str = "") -> float:
         raise ModelError(f"{where} must be a real number{text}")
     try:
         number = float(given)
+    except OverflowError:  # an integer beyond them
+        raise ModelError(f"{where} must be finite; got a number beyond 1e308") from None
     except (TypeError, ValueError):
         raise ModelError(f"{where} must be a number; got {type(value).__name__}{hint * _is_array(value)}") from None
     if not math.isfinite(number):

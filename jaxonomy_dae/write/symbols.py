@@ -34,11 +34,13 @@ class ComponentSymbol(sympy.Symbol):
             _refuse(f"`{self} != {other}`", self, other)
         return super().__ne__(other)
 
+    # Python takes the hash from a class that defines `__eq__`.
     __hash__ = sympy.Symbol.__hash__
 
 
 def _refuse(comparison: str, symbol: sympy.Symbol, number: object):
     """Raises a `ModelError` unless SymPy or this package compares symbols as what they are."""
+    # Wrappers that check types, in tests, stand between a line and the comparison in it.
     caller, package = sys._getframe(1), __name__
     while caller is not None and (package == __name__ or package.startswith(("jaxtyping", "beartype"))):
         caller, package = caller.f_back, caller.f_globals.get("__name__", "")
@@ -167,6 +169,7 @@ def seen_from_child(value: Any) -> Any:
     """An argument of a component that is being made: symbols in it, of the place where it is made, get `../` paths."""
     if isinstance(value, sympy.Basic):
         outside: dict[sympy.Basic, sympy.Basic] = {}
+        # Time is the same symbol everywhere, and gets no path.
         for s in value.free_symbols:
             if isinstance(s, VariableSymbol):
                 outside[s] = VariableSymbol(f"../{s.path}", s.order)
@@ -250,6 +253,7 @@ def der(expression: object) -> sympy.Expr:
                 "Use the symbols that `self.variable(...)` and `self.parameter(...)` return."
             )
     try:
+        # By this package's graphs: SymPy's `diff` takes other variables for constants.
         slope = directional_derivative(read(expression, symbol_label, marks=True), raised(moved, TIME_LABEL))
     except UnsupportedExpression as error:
         raise ModelError(f"der({shortened(expression)}): {error}") from None

@@ -90,6 +90,7 @@ def in_relations_of_time(condition: Condition) -> Condition:
     if found is None:
         return condition
     slope, head, level = found
+    # The sign of a slope that follows parameters is not known here, and decides between And and Or.
     if not isinstance(head, sympy.Max | sympy.Min | sympy.Abs) or not slope.is_number:
         return condition
     order: Any = type(condition) if slope > 0 else _OPPOSITE[type(condition)]
@@ -122,6 +123,7 @@ def _in_time(relation: Condition) -> tuple[Expression, Expression, Expression] |
         return None
     left, right = _sides(relation)
     found = _with_one_head(left - right)
+    # Where nothing changes with time, sides are constant: such a relation never turns.
     if found is None or found[1] is None:
         return None
     slope, head, rest = found

@@ -40,6 +40,7 @@ def as_number(value: Truth) -> Any:
     """A truth as 1 or 0; other values as they are."""
     if isinstance(value, bool):
         return int(value)
+    # A symbol is a `Boolean` for SymPy, too; here it stands for a number.
     if isinstance(value, Boolean) and not isinstance(value, sympy.Symbol):
         return sympy.Piecewise((1, value), (0, True), evaluate=False)
     return value

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import sympy
+from attack import descriptors
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
 from jaxonomy_dae.base.tolerances import ILL_CONDITIONED
 from jaxonomy_dae.compile.passes.combine_equations import combine, quantity_label
+from jaxonomy_dae.compile.passes.combined_errors import errors_of_combination
 from jaxonomy_dae.compile.passes.null_vectors import cancels, left_null_vectors
 from jaxonomy_dae.errors import StructuralError
 from jaxonomy_dae.graph.expressions.differentiate import directional_derivative
@@ -242,3 +244,41 @@ def test_numbers_that_are_dependent_to_some_roundings(roundings):
         "yz", lambda y, z, t: (a * der(y) + b * der(z) + 1.9 * y - 1, c * der(y) + last * der(z) + 0.6 * z)
     )
     assert len(system.states) == 1
+
+
+@pytest.mark.parametrize("seed", [62000002, 7074])
+def test_combinations_of_combinations_know_their_errors(seed):
+    """Nilpotent blocks of 2 and 3 behind dense factors: the fifth combination in a row decides whether there is one
+    mode or two, and its coefficients are off by a thousand roundings."""
+    case = descriptors.make(seed)
+    assert len(AcausalCompiler(case.ev, case.diagram)().states) == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_coefficients_of_a_combination_are_known_to_their_bounds(seed):
+    """Where coefficients move by their errors, the combination moves by no more than the bounds, and at worst by more
+    than a hundredth of them."""
+    rng = np.random.default_rng(seed)
+    n = 4
+    x, y = ([quantity_label(v, order) for v in range(n)] for order in (1, 0))
+    a = 10.0 ** rng.uniform(-3, 3, (n, 1)) * (rng.normal(size=(n, n - 1)) @ rng.normal(size=(n - 1, n)))
+    b = rng.normal(size=(n, n))
+
+    def weights(a):
+        return np.append(np.linalg.lstsq(a[:-1].T, -a[-1], rcond=None)[0], 1.0)
+
+    equations = [linear((c, leaf(q)) for q, c in zip([*x, *y], [*a[i], *b[i]], strict=True)) for i in range(n)]
+    found, worst = weights(a), 0.0
+    for _ in range(100):
+        # Only moves that keep the matrix singular have a combination.
+        u, s, vt = np.linalg.svd((a * (1 + 1e-8 * rng.choice([-1, 1], a.shape))) / a.std(1, keepdims=True))
+        moved, other = (
+            a.std(1, keepdims=True) * (u[:, :-1] * s[:-1]) @ vt[:-1],
+            b * (1 + 1e-8 * rng.normal(size=(n, n))),
+        )
+        by = np.abs(np.hstack([moved - a, other - b]))
+        errors = [dict(zip([*x, *y], row, strict=True)) for row in by.tolist()]
+        bounds = errors_of_combination(equations, errors, list(map(constant, found)), n - 1, x, exact=False)
+        off = np.abs(weights(moved) @ other - found @ b)
+        worst = max(worst, float(np.max(off / [bounds[q] for q in y])))
+    assert 0.01 < worst < 1.001  # to first order

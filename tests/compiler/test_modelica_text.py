@@ -31,6 +31,29 @@ def value_of(text: str, **names):
 # --- grammar ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    "text, value",
+    [
+        ("[v]", [[1], [2]]), ("[v, w]", [[1, 3], [2, 4]]), ("[v; w]", [[1], [2], [3], [4]]),
+        ("[A, v]", [[1, 2, 1], [3, 4, 2]]), ("[A; A]", [[1, 2], [3, 4], [1, 2], [3, 4]]),
+        ("A ^ 2", [[7, 10], [15, 22]]), ("A ^ 0", [[1, 0], [0, 1]]), ("A .^ 2", [[1, 4], [9, 16]]),
+        ("{i + 10 * j for i in 1:2, j in 1:3}", [[11, 12], [21, 22], [31, 32]]),
+        ("symmetric(A)", [[1, 2], [2, 4]]),
+    ],
+)  # fmt: skip
+def test_matrices(text, value):
+    """Vectors in brackets are columns, `^` multiplies matrices, and the last iterator counts the rows (Modelica
+    Language Specification 3.6, sections 10.4.2, 10.6.7, 10.4.1.1)."""
+    assert value_of(text, v=[1, 2], w=[3, 4], A=[[1, 2], [3, 4]]) == value
+
+
+def test_products_of_other_sizes_are_refused():
+    with pytest.raises(ModelError, match=r"the product of arrays of sizes \[2\] and \[3\]: 2 is not 3"):
+        value_of("{1, 2} * {1, 2, 3}")
+    with pytest.raises(ModelError, match=r"a square matrix has powers 0, 1, 2, …; got sizes \[2\] to the power 2"):
+        value_of("{1, 2} ^ 2")
+
+
 def test_a_sign_binds_as_a_sum_does():
     """-a * b is -(a * b), and a - b - c is (a - b) - c (Modelica Language Specification 3.6, section 3.2)."""
     a, b = (Reference((n,), ((),)) for n in "ab")
@@ -78,6 +101,19 @@ def test_syntax_errors_say_where(text, where, what):
     with pytest.raises(ModelError) as error:
         read_base(text)
     assert where in str(error.value) and what in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["within a", 'function f external "C" g(x)'])
+def test_texts_that_end_too_early(text):
+    with pytest.raises(ModelError, match="expected ';', at ''"):
+        read_base(text)
+
+
+def test_escapes_in_strings_and_ranges_without_a_step():
+    assert value_of(r'"a \"b\"\n" + "c"') == 'a "b"\nc'
+    assert value_of("String(true)") == "true"
+    with pytest.raises(ModelError, match="the range 1:0:3 has no step"):
+        value_of("1:0:3")
 
 
 def test_a_text_of_a_megabyte_is_read_in_near_linear_time():

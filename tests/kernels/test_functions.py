@@ -11,6 +11,8 @@ from function_table import FUNCTIONS
 from problems import run
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
+from jaxonomy_dae.graph.expressions.from_sympy import read
+from jaxonomy_dae.graph.expressions.kernel import Kernel
 from jaxonomy_dae.write import Eq
 
 NAMES = list(FUNCTIONS)
@@ -229,6 +231,16 @@ def test_conditions_that_mix_time_and_variables():
 
 
 @pytest.mark.slow
+def test_an_arccotangent_has_a_slope_at_zero_and_large_binomials_a_value():
+    x, n = sympy.symbols("x n", real=True)
+    kernel = Kernel([read(sympy.acot(x), str), read(sympy.binomial(n, 3), str)], ["x", "n"])
+    assert float(jax.grad(lambda v: kernel([v, 5.0])[0])(0.0)) == -1.0
+    for count in (5.0, 170.0, 200.0):  # n·(n − 1)·(n − 2)/6
+        value, slope = jax.value_and_grad(lambda v: kernel([0.0, v])[1])(count)
+        np.testing.assert_allclose(value, count * (count - 1) * (count - 2) / 6, rtol=1e-12)
+        np.testing.assert_allclose(slope, (3 * count**2 - 6 * count + 2) / 6, rtol=1e-11)
+
+
 def test_a_negative_base_is_not_a_number():
     """A fractional power of a negative number is NaN, at compile time too, where the test points are negative."""
 

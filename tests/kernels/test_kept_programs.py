@@ -144,14 +144,13 @@ def test_other_processors_find_nothing(quickly, folder, monkeypatch):
     assert records(since) == [("wave", "quick")] and len(list(folder.iterdir())) == 4
 
 
-def test_the_folder_does_not_grow_beyond_its_room(tmp_path, monkeypatch):
+def test_the_folder_does_not_grow_beyond_its_room(tmp_path):
     """Kind of defect: files of the user's in the folder that he had named were counted, and deleted."""
     ours = [f"{digit * 64}.program" for digit in "abc"]
     for name, age in ((ours[0], 3), (ours[1], 1), (ours[2], 2), ("measurements.h5", 9), ("a" * 64, 9)):
         (tmp_path / name).write_bytes(bytes(100))
         os.utime(tmp_path / name, (time.time() - age, time.time() - age))
-    monkeypatch.setattr(kept, "ROOM", 250)
-    kept._make_room(tmp_path)
+    kept.make_room(tmp_path, kept.OURS, room=250)
     left = {file.name for file in tmp_path.iterdir()}
     assert left == {ours[1], ours[2], "measurements.h5", "a" * 64}  # ours that was used longest ago has gone
 

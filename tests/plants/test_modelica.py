@@ -235,3 +235,30 @@ end 'M';
     assert run.events.terminated == "an assertion is violated: the level is too low"
     assert float(run.events.ts[0]) == pytest.approx(0.5, abs=1e-9)
     assert jax.grad(lambda least: when(least).events.ts[0])(0.5) == pytest.approx(-1.0, abs=1e-9)
+
+
+QUIET = """//! base 0.1.0
+package 'm'
+model 'm'
+  Real 'x'(start = -1, fixed = true);
+  Real 'y';
+  Real 'z';
+equation
+  der('x') = 1;
+  'y' = if noEvent('x' > 0) then 1 else 2;
+  'z' = if EVENT then 1 else 2;
+end 'm';
+end 'm';"""
+
+
+@pytest.mark.parametrize("condition, events", [("'x' > 0", True), ("noEvent('x' > 0)", False)])
+def test_a_relation_in_noevent_is_an_event_elsewhere(condition, events):
+    assert (compiled(QUIET.replace("EVENT", condition)).plan.events is not None) == events
+
+
+def test_the_entries_of_a_matrix_of_truths():
+    text = QUIET.replace("  Real 'z';", "  Real 'z';\n  Boolean[2, 2] 'b';")
+    text = text.replace("equation", "equation\n  'b' = {{time > 1, 'x' > 5}, {false, true}};")
+    system = compiled(text.replace("EVENT", "'b'[1, 1] and 'b'[2, 2]"))
+    assert system.observe(["m.z"], 2.0, jnp.zeros(1)).tolist() == [1]
+    assert system.observe(["m.z"], 0.5, jnp.zeros(1)).tolist() == [2]

@@ -24,6 +24,7 @@ def explained_keywords(elsewhere: Mapping[str, str] = NOWHERE) -> Callable[[Call
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         known = keywords_of(function)
+        # A mistake of this package, which shows when the module is imported.
         if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in inspect.signature(function).parameters.values()):
             raise TypeError(f"{function.__qualname__} hands any keyword on")
 

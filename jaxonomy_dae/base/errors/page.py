@@ -36,6 +36,7 @@ def entries() -> tuple[Entry, ...]:
 
 @functools.cache
 def _patterns() -> tuple[tuple[re.Pattern[str], Entry], ...]:
+    # A gap ends with its line, so that one entry does not join two sentences of a message.
     return tuple((re.compile(r"[^\n]*?".join(map(re.escape, entry.text.split(GAP)))), entry) for entry in entries())
 
 

@@ -73,6 +73,7 @@ def short_of_equations(flat: FlatModel, concerned: np.ndarray, names: Sequence[s
     owners = [flat.components[k] for k in np.unique(v.owner[concerned & v.is_port]).tolist()]
     for found in balances(flat, owners):
         if found.surplus < 0:
+            # What is missing determines a variable of the component, if any of the undetermined ones is.
             own = [n for n in names if n.startswith(f"{found.component}.")] or names
             return f"{found} Probably missing is one for {listed(own, joint='or')}."
     return ""

@@ -54,6 +54,8 @@ class Explainer:
         if not 1 < len(rows) <= DECOMPOSED_UPTO:
             return rows, variables
         matrix = np.zeros((len(rows), len(variables)))
+        # Coefficients that follow values count as any numbers, which cancel by no chance. The seed is fixed, so that
+        # the message is the same each time.
         random = np.random.default_rng(0)
         for i, row in enumerate(rows.tolist()):
             inside = slice(self.start[row], self.start[row + 1])

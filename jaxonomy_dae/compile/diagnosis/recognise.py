@@ -64,6 +64,7 @@ def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTa
         elif kind == "across" or not set(say.components(rows)) <= afloat:
             seen = too_often.setdefault((kind, *say.where(rows, variables)), [rows, variables, kind, []])
             seen[3].append(say.quantity(variables))
+    # One sentence for a joint, with all quantities that it determines twice.
     for rows, variables, kind, quantities in too_often.values():
         texts.append(say.once_too_often(rows, variables, kind, list(dict.fromkeys(quantities))))
     if not texts:

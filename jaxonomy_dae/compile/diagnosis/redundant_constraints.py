@@ -115,6 +115,8 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
     c = np.bincount(at.model.extended.base) - 1
     if len(np.unique(c[rows])) > 1:
         return []  # constraints of several orders: their Jacobian is no derivative by one set of quantities
+    # The quantities that constraints restrict: those below the highest derivative by as many orders as they are
+    # differentiated.
     position = quantities.first[columns] + quantities.highest[columns] - c[rows[0]]
     sampled = None
     if len(rows) > WHOLE:

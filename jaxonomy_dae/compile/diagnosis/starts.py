@@ -98,6 +98,7 @@ def _check_linear(flat: FlatModel, groups, alias: AliasTable, started: np.ndarra
     highest = 1 + alias.order[started].max()
     value, variable = np.full((len(flat.variables), highest), np.nan), np.zeros((len(flat.variables), highest), int)
     place = alias.root[started], alias.order[started]
+    # By quantity, so that each equation is judged by a look-up, however many starts there are.
     value[place], variable[place] = numbers, started
     for group in groups:
         if not isinstance(group.template, LinearTemplate) or not group.variable.shape[1]:

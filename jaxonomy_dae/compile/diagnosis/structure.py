@@ -77,6 +77,7 @@ def check_structure(
                 # equations too.
                 under = [one for one in under if not _only_through(flat, np.isin(alias.root, unknown[one[1]]))]
                 continue
+            # Columns are roots of alias classes, which may have a name that the user never wrote.
             best = _best(flat, alias, unknown, columns).tolist()
             texts.append(_too_many(flat, *_with_multiples(flat, alias, rows, groups, columns, best)))
         empty = [provenance_of(groups, int(rows[0])) for rows, columns in over if not len(columns)]

@@ -20,6 +20,7 @@ def unused_parameters(flat: FlatModel) -> list[int]:
     for dependents in reversed(table.dependents):  # each reads only those before it
         read = dependents.parameter[used[dependents.target]]
         used[read.ravel()] = True
+    # Discrete variables are results as well.
     used[table.discrete] = True
     return np.flatnonzero(~used[: table.n_declared]).tolist()
 

@@ -50,6 +50,7 @@ class EntrySizes:
 
     def _evaluated(self, group: int) -> np.ndarray:
         chosen = self.extended.groups[group]
+        # Networks are not called while a model is compiled: their sizes count as one.
         if chosen.template.opaque is not None:
             return np.ones(chosen.quantity.shape)
         # `fmax` takes the number where one of the points gives none.

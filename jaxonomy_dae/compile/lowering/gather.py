@@ -84,6 +84,7 @@ class Gather:
             value = source if _is_scalar(source) else take(source, self.offset)
         else:
             value = self._from_several(chunks, dtype)
+        # One factor for all is a number of the program, and ±1 costs nothing.
         same = (self.factor == self.factor[0]).all()
         return times(float(self.factor[0]) if same else jnp.asarray(self.factor, dtype), value)
 

@@ -156,6 +156,7 @@ def _with_known(template: AbstractTemplate, columns: tuple[int, ...]) -> Abstrac
         return template
     relations = {leaf(parameter_label(k)) for k in columns}
     known: dict[Node, Node] = {}
+    # Between events a relation is 1 or 0: the branch in which it is as its sides say is left out.
     for n in postorder([template.graph]):
         asks = n.operation == "equal" and not relations.isdisjoint(n.arguments)
         if asks and any(number(a) == LIVE for a in n.arguments):

@@ -172,9 +172,14 @@ class SystemPlan:
         return self.flat.variables.index
 
     @functools.cached_property
+    def state_names(self) -> tuple[str, ...]:
+        """The names of the states. Loops ask for them again and again; 1,000 take 2 ms to be put together."""
+        return tuple(self.quantity_name[q] for q in self.states)
+
+    @functools.cached_property
     def digest_of_states(self) -> str:
         """A digest of what the entries of a whole state mean: the names of states and of discrete variables."""
-        names = [self.quantity_name[q] for q in (*self.states, *self.carried)]
+        names = [*self.state_names, *(self.quantity_name[q] for q in self.carried)]
         known = self.flat.parameters.names
         discrete = [] if self.events is None else [known[int(k)] for k in self.events.discrete]
         return hashlib.sha256(repr((names, discrete)).encode()).hexdigest()

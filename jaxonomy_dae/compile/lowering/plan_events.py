@@ -154,6 +154,7 @@ def _opposite(table: EventTable) -> tuple[int, ...]:
 def _contested(table: EventTable, state: np.ndarray, n_discrete: int) -> tuple[tuple[int, int], ...]:
     """(event, place) for what several events write, if not all of them the same number. Events that choose a mode or
     turn a relation exclude each other, and contacts strike as one."""
+    # Events that cannot happen at one instant, or are meant to, cannot contest what they write.
     exclusive = table.are(EventFlag.RELATION | EventFlag.REVOCABLE | EventFlag.STRIKE)
     writers: dict[int, list[int]] = {}
     for row, event in enumerate(table.event.tolist()):

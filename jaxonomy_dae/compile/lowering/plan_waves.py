@@ -77,6 +77,7 @@ def _waves(template: AbstractTemplate) -> tuple[Wave, ...]:
                     template_of(substitute(argument, {TIME_LABEL: ZERO}), (), *counts) if fixed else None,
                     None if weight is None else template_of(weight, (), *counts),
                 )
+    # A sine and a cosine of one argument are one wave.
     return tuple(dict.fromkeys(found.values()))
 
 

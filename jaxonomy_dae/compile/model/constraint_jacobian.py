@@ -84,6 +84,7 @@ def gathered(
     by_base = {}
     first = equation_offsets(groups)
     for group in extended.groups:
+        # At level zero stand the equations as written.
         if group.level == 0:
             g = int(np.searchsorted(first, group.base[0], side="right") - 1)
             by_base[g] = group

@@ -27,6 +27,7 @@ def quantity_bounds(model: ReducedModel) -> np.ndarray:
     low, high = np.full(n, -np.inf), np.full(n, np.inf)
     v = np.flatnonzero(variables.quantity >= 0)
     (a, b), q = (flat.variables.bounds[v] / variables.factor[v, None]).T, variables.quantity[v]
+    # A negative factor exchanges the bounds.
     np.maximum.at(low, q, np.minimum(a, b))
     np.minimum.at(high, q, np.maximum(a, b))
     return np.stack([low, high], axis=-1)

@@ -26,6 +26,7 @@ def entries_of(groups: tuple[EquationGroup, ...], unknown: np.ndarray) -> Entrie
     numbers = [group.template.numbers(group.coefficient) * group.factor for group in groups]
     coefficient = np.concatenate([np.zeros(0), *(number.ravel() for number in numbers)])
     used = variable != ZERO
+    # ZERO is −1 and would read the last entry.
     used[used] = unknown[variable[used]]
     entries = Entries(row, variable, order, coefficient, int(equation_offsets(groups)[-1]))
     return entries.take(used)

@@ -75,6 +75,7 @@ class LinearTemplate(AbstractTemplate):
 
 def scaled(c: Numeric, s: Numeric) -> Numeric:
     """c·s for a numeric coefficient, a number or one for each instance."""
+    # Products with ±1 would be operations of a program, for nothing.
     if np.ndim(c) == 0:
         if c == 1:
             return s

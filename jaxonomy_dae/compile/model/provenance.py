@@ -118,6 +118,7 @@ class Lines:
 
     def of(self, number: int) -> str:
         """The line of a component; "" if it is not known."""
+        # By a search: only messages ask.
         places = zip(self._numbers, self._lines, strict=True)
         return next((line for numbers, line in places if number in numbers), "")
 

@@ -44,6 +44,7 @@ class QuantityNames(Sequence[str]):
     def _best(self) -> np.ndarray:
         """The variable that names each quantity, −1 for derivatives of others."""
         order, table, variables = self._quantities.order, self._flat.variables, self._variables
+        # A multiple of a quantity does not name it: its values would be read with another sign or in another unit.
         v = np.flatnonzero((variables.quantity >= 0) & (variables.factor == 1))
         q = variables.quantity[v]
         is_root = (order[q] == 0) & (self._quantities.variable[self._quantities.owner[q]] == v)

@@ -189,6 +189,7 @@ class SymbolicTemplate(AbstractTemplate):
     def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Numeric:
         def solved() -> list[Node]:
             rest = substitute(self.graph, {slot_label(self.slots[position]): constant(0)})
+            # Affine in the slot, F is zero at −F(0)/(∂F/∂slot).
             return [scale(-1, divide(rest, self.partials[position]))]
 
         return self._evaluate(("solve", position), solved, (slots, parameters, coefficients, t), backend)[0]

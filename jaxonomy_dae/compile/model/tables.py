@@ -102,6 +102,7 @@ class ParameterTable:
     def everything(self, declared: np.ndarray) -> np.ndarray:
         """The values of all parameters, given those that were declared, (n_declared,)."""
         values = np.concatenate([declared, self.relation_starts])
+        # Before the first event, what discrete variables were is what they are.
         return np.concatenate([values, values[self.discrete]])
 
     @property

@@ -13,6 +13,7 @@ from ..model.group import Point, QuantityGroup
 from ..model.natural_sizes import natural_sizes
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 from .combine_equations import quantity_label, somewhere, tried
+from .combined_errors import CombinedGroup
 from .elimination import Row
 from .null_vectors import BlockMatrix
 
@@ -76,7 +77,10 @@ class HighestDerivatives:
             else:
                 at = Point.of(point.ravel(), self.values, 0.37 + 0.1 * trial)
                 own = group.reading(np.arange(point.size).reshape(point.shape))
-                found = own.partials(at), own.partial_errors(at, KNOWN * np.abs(at.values))
+                errors = own.partial_errors(at, KNOWN * np.abs(at.values))
+                # Numbers of a combination are known to the errors of its terms.
+                errors = np.maximum(errors, group.error) if isinstance(group, CombinedGroup) else errors
+                found = own.partials(at), errors
             self._partials[g, trial] = found
         return self._partials[g, trial]
 

@@ -7,7 +7,7 @@ or a function of the parameters, the equation Σ wᵢ Fᵢ^(cᵢ − c_min), in 
 one of lowest cᵢ, and index reduction starts again: the linear combination method of Tan, Nedialkov & Pryce (2017).
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -29,6 +29,7 @@ from ..model.provenance import Provenance, combination
 from ..model.tables import ZERO, EquationGroup, ParameterTable, equation_offsets, provenance_of
 from . import elimination
 from .combine_equations import combine, graph_of, group_of, has_branches, near, quantity_label, slope_left, tried
+from .combined_errors import errors_of_combination, own_errors, with_errors, without_errors
 from .elimination import Row
 from .highest_derivatives import HighestDerivatives
 from .null_vectors import null_vectors, rational
@@ -75,7 +76,7 @@ def reduce_with_cancellation(
                 replaced.append(found[0])
                 added.append(found[1])
         if not added:
-            return groups, signature, offsets, tuple(notes)
+            return tuple(map(without_errors, groups)), signature, offsets, tuple(notes)
         sources = [group.provenance[0] for group in added]
         notes += [f"highest derivatives cancel in {'a ' if source.sources else ''}{source}" for source in sources]
         groups = (*_without(groups, replaced), *added)
@@ -162,7 +163,7 @@ def _numeric_combination(
     used = sorted(weights)
     parts = _parts(jacobian, equations[used], columns)
     chosen: list[Node] = [constant(weights[k] / weights[used[parts.unit]]) for k in used]
-    return _replacement(jacobian, parts, chosen, np.zeros(0, np.int64))
+    return _replacement(jacobian, parts, chosen, np.zeros(0, np.int64), exact=True)
 
 
 def _sampled_combination(
@@ -211,18 +212,20 @@ def _sampled_combination(
         raise StructuralError("\n".join([said, *itemised(parts.sources)]))
     if any(has_branches(slope_left(parts.graphs, found, label), of_parameters=False) for label in parts.top):
         return None  # regular in general: singular where a condition says so
-    return _replacement(jacobian, parts, found, discrete)
+    return _replacement(jacobian, parts, found, discrete, exact=False)
 
 
 class _Parts(NamedTuple):
     """Equations to be combined: their numbers, and graphs of them, differentiated so that the same derivatives are
-    their highest; the place of one that is not differentiated; the labels of what cancels; who wrote them."""
+    their highest; the place of one that is not differentiated; the labels of what cancels; who wrote them; the errors
+    of their coefficients, beside rounding, by labels."""
 
     equations: np.ndarray
     graphs: list[Node]
     unit: int
     top: list
     sources: list[Provenance]
+    errors: list[dict[Hashable, float]]
 
 
 def _parts(jacobian: HighestDerivatives, equations: np.ndarray, columns: np.ndarray) -> _Parts:
@@ -232,26 +235,30 @@ def _parts(jacobian: HighestDerivatives, equations: np.ndarray, columns: np.ndar
     # F₁ − F₂′ does so in its derivatives, too.
     lowest = int(c.min())
     places = [jacobian.place(e) for e in equations.tolist()]
-    graphs = [graph_of(jacobian.groups[g], i, k) for (g, i), k in zip(places, (c - lowest).tolist(), strict=True)]
+    given = [(jacobian.groups[g], i, k) for (g, i), k in zip(places, (c - lowest).tolist(), strict=True)]
+    graphs = [graph_of(*each) for each in given]
     sources = [jacobian.groups[g].provenance[i] for g, i in places]
     known = [graph for graph in graphs if graph is not None]
     if len(known) < len(graphs):
         raise StructuralError(_hidden(sources))
-    return _Parts(equations, known, int(np.argmin(c)), _highest(jacobian, columns, lowest), sources)
+    errors = [own_errors(*each) for each in given]
+    return _Parts(equations, known, int(np.argmin(c)), _highest(jacobian, columns, lowest), sources, errors)
 
 
 def _replacement(
-    jacobian: HighestDerivatives, parts: _Parts, weights: Sequence[Node], discrete: np.ndarray
+    jacobian: HighestDerivatives, parts: _Parts, weights: Sequence[Node], discrete: np.ndarray, exact: bool
 ) -> tuple[int, EquationGroup]:
-    """The equation at `unit`, and Σ weight·equation in its place, in which the quantities `top` are gone."""
-    equations, graphs, unit, top, sources = parts
+    """The equation at `unit`, and Σ weight·equation in its place, in which the quantities `top` are gone. `exact`: the
+    weights are."""
+    equations, graphs, unit, top, sources, errors = parts
     combined = combine(graphs, weights, top, jacobian.values, discrete, lambda: jacobian.natural(equations))
     if combined is None:
         raise StructuralError(_hidden(sources))
     if not any(label[0] == "quantity" for label in combined.leaves):
         raise StructuralError(_dependent(sources))
     origin = combination(sources) if len(sources) > 1 else sources[0]
-    return int(equations[unit]), group_of(combined, origin)
+    bounds = errors_of_combination(graphs, errors, weights, unit, top, exact)
+    return int(equations[unit]), with_errors(group_of(combined, origin), bounds)
 
 
 def _for_values(

@@ -1,5 +1,6 @@
 """Reads SymPy expressions into graphs."""
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 from fractions import Fraction
 
@@ -27,6 +28,8 @@ from .node import (
 )
 from .smooth import Smooth, marked
 from .without_overflow import logarithm, logarithm_of_one_plus, product, raised
+
+MOST_FACTORIAL = 170  # whose factorial double precision holds
 
 
 class UnsupportedExpression(Exception):
@@ -178,6 +181,22 @@ def _beta(a: Node, b: Node | None = None) -> Node:
     return multiply(*(apply("gammasign", u) for _, u in powers), size)
 
 
+def _binomial(n: Node, k: Node) -> Node:
+    over = linear([(1, n), (-1, k)])
+    whole = divide(_factorial(n), multiply(_factorial(k), _factorial(over)))
+    # 171! overflows. Before that, factorials keep more digits than their logarithms, and are zeros and poles where
+    # binomial coefficients have them.
+    parts = multiply(linear([(1, n)], 1), _beta(linear([(1, over)], 1), linear([(1, k)], 1)))
+    return select(compare("less", n, constant(MOST_FACTORIAL)), whole, power(parts, -1))
+
+
+def _arccotangent(u: Node) -> Node:
+    """atan(1/u); within ±1 as a right angle less atan(u), which has a derivative at zero, too."""
+    right_angle = select(compare("less", u, constant(0)), constant(-math.pi / 2), constant(math.pi / 2))
+    near = linear([(1, right_angle), (-1, apply("atan", u))])
+    return select(compare("less", apply("abs", u), ONE), near, apply("atan", power(u, -1)))
+
+
 def _frac(u: Node) -> Node:
     return linear([(1, u), (-1, apply("floor", u))])
 
@@ -217,7 +236,7 @@ _WRITTEN: dict[object, Callable[..., Node]] = {
     sympy.sinc: _sinc,
     sympy.factorial: _factorial,
     sympy.beta: _beta,
-    sympy.binomial: lambda n, k: divide(_factorial(n), multiply(_factorial(k), _factorial(linear([(1, n), (-1, k)])))),
+    sympy.binomial: _binomial,
     sympy.erf2: lambda a, b: linear([(1, apply("erf", b)), (-1, apply("erf", a))]),
     sympy.erfcinv: lambda u: apply("erfinv", linear([(-1, u)], 1)),
     sympy.digamma: lambda u: polygamma(0, u),
@@ -227,7 +246,7 @@ _WRITTEN: dict[object, Callable[..., Node]] = {
     sympy.csc: _reciprocal("sin"),
     sympy.coth: _reciprocal("tanh"),
     sympy.csch: _reciprocal("sinh"),
-    sympy.acot: _of_reciprocal("atan"),
+    sympy.acot: _arccotangent,
     sympy.asec: _of_reciprocal("acos"),
     sympy.acsc: _of_reciprocal("asin"),
     sympy.acoth: _of_reciprocal("atanh"),
@@ -244,6 +263,7 @@ _WRITTEN: dict[object, Callable[..., Node]] = {
     sympy.Ge: lambda a, b: compare("less_equal", b, a),
     sympy.Eq: lambda a, b: compare("equal", a, b),
     sympy.Ne: lambda a, b: negate(compare("equal", a, b)),
+    # All that can be read is real.
     sympy.re: lambda u: u,
     sympy.conjugate: lambda u: u,
     sympy.KroneckerDelta: lambda a, b: select(compare("equal", a, b), ONE, constant(0)),

@@ -101,6 +101,7 @@ class _Walk:
     def run(self, root: Node, open_above: tuple[str, ...], is_zero: bool) -> list[str]:
         """Walks through the graph; operations `open_above` at its top join what need not agree, but what they join
         `is_zero`, each for itself."""
+        # Branches of one equation may be in different units, since only one of them is zero at a time.
         tops, joints, stack = set(), set(), [root]
         while stack:
             node = stack.pop()
@@ -127,6 +128,7 @@ class _Walk:
         if operation == "sum":
             start, coefficients = node.data
             terms = [
+                # Texts are made when a misfit is found: most equations have none, and SymPy prints slowly.
                 Term(lambda c=c, a=a: _text(a, c), None if a.leaves == TIME and abs(c) != 1 else known, float(c))
                 for c, a, known in zip(coefficients, node.arguments, inside, strict=True)
             ]
@@ -137,6 +139,7 @@ class _Walk:
             # The exponent 0.3333333333333333 is meant as 1/3.
             return self._product(node, inside, [Fraction(e).limit_denominator(10**6) for e in node.data])
         if operation == "power":
+            # An exponent that is constant has become a product's power before.
             self._needs_number(node.arguments[1], "an exponent is a number")
             self._needs_number(node.arguments[0], "what is raised to an exponent that is not constant is a number")
             return None if inside[0] is None else UnitOfValue(NUMBER)
@@ -167,6 +170,7 @@ class _Walk:
             if value is None:
                 known = False
                 continue
+            # 20 degC squared is not 400 of anything: values on such a scale are no multiples of its unit.
             if value.unit.zero and power != 1:
                 self.found.append(
                     f"{value.unit} has a zero of its own, so '{_text(argument)}' cannot stand in a power or quotient: "
@@ -176,6 +180,7 @@ class _Walk:
             factors.append((value, power))
         if not known:
             return None
+        # Signs are left out: −1000 converts units as 1000 does.
         number = math.prod(abs(v.number) ** float(p) for v, p in factors)
         is_loose = any(v.is_loose or v.unit.zero for v, _ in factors)
         return UnitOfValue(product((v.unit, p) for v, p in factors), number, is_loose=is_loose)
@@ -193,6 +198,7 @@ class _Walk:
 
     def _same(self, nodes: Sequence[Node], values: Iterable[UnitOfValue | None], rule: str) -> UnitOfValue | None:
         values = list(values)
+        # A maximum of two temperatures in degC is one, where a sum of two is none.
         points = {v.unit for v in values if v is not None and v.unit.zero}
         terms = [Term(lambda a=a: _text(a), v) for a, v in zip(nodes, values, strict=True)]
         others = [v for v in values if v is not None and not v.unit.zero]
@@ -286,6 +292,7 @@ def _most_common(items: Sequence[object]) -> object:
 
 def _common_scale(values: Sequence[UnitOfValue]) -> float | None:
     """The factor of a unit in which all values may be read; None if there is none."""
+    # The units as they are come first: numbers convert only where units differ.
     candidates = [v.unit.scale for v in values]
     candidates += [v.unit.scale / v.number for v in values if v.number]
     return next((s for s in candidates if all(_fits(v, s) for v in values)), None)

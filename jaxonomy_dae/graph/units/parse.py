@@ -22,6 +22,7 @@ class UnknownUnit(ValueError):
     """A text that is not a unit; `str` says why not."""
 
 
+# Pint reads its file of definitions when a registry is made, which takes long.
 @functools.lru_cache(maxsize=1)
 def _registry() -> Any:
     return optional_module("pint", "units", "check_units=True needs Pint").UnitRegistry()
@@ -43,6 +44,7 @@ def read_unit(text: str) -> Unit | None:
     spelled = re.sub(r"[A-Za-z]+", lambda word: SPELLINGS.get(word[0], word[0]), text)
     why = "it cannot be read"
     if LEGAL.fullmatch(text):
+        # As it stands first: a unit's own name may contain a digit, as cmH2O does.
         for spelling in (spelled, EXPONENT.sub(r"**\1", spelled)):  # powers need no sign of their own: m2, s-1
             try:
                 return _linear(registry, registry.parse_units(spelling), text)

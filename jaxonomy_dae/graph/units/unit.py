@@ -54,6 +54,7 @@ def rate(unit: Unit, order: int) -> Unit:
     found = product([(unit, Fraction(1)), (SECOND, Fraction(-order))])
     power = "" if order == 1 else str(order)
     is_simple = unit.text not in ("", "1") and not unit.zero and not set(unit.text) & set("/ ^-")
+    # A unit that is a quotient or has a zero of its own is written in SI symbols: "m/s/s" would be read wrongly.
     return dataclasses.replace(found, text=f"{unit.text}/s{power}" if is_simple else "")
 
 

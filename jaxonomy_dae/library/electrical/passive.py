@@ -145,6 +145,7 @@ class Diode(TwoPin):
         super().__init__(ev, name)
         saturation = self.parameter("Is", Is, unit="A", bounds=POSITIVE)
         thermal = self.parameter("Vt", Vt, unit="V", bounds=POSITIVE)
+        # Far below zero the exponential has no slope, and a block of diodes without a leak would be singular.
         leak = self.parameter("R", R, unit="Ohm", bounds=POSITIVE)
         voltage, current = self._two_pins()
         x = voltage / thermal

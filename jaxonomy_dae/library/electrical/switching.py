@@ -27,6 +27,7 @@ class Switch(TwoPin):
         v, i = self._two_pins()
         self.either(Eq(closed, 1), v - on * i, i - off * v)
         self.declare_dissipation(v * i)
+        # Both are strict: a signal that rests at the threshold switches nothing.
         self.when(u > level, assign(closed, 1), on=Eq(closed, 0), at_start=True)
         self.when(u < level, assign(closed, 0), on=Eq(closed, 1), at_start=True)
 

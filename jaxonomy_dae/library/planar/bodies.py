@@ -111,6 +111,7 @@ class Link(TwoFrames):
     def __init__(self, ev: EqnEnv, name: str, rx: Value = 1.0, ry: Value = 0.0, phi: Value | None = None):
         super().__init__(ev, name)
         ahead, aside = self.parameter("rx", rx, unit="m"), self.parameter("ry", ry, unit="m")
+        # Without a parameter the angles of both frames are one variable, and alias elimination takes the other out.
         turned = 0 if phi is None else self.parameter("phi", phi, unit="rad")
         a, b = self._two_frames()
         dx = ahead * cos(a.phi) - aside * sin(a.phi)

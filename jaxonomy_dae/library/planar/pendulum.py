@@ -47,6 +47,7 @@ class PlanarPendulum(Component):
         self.add_equations(
             Eq(der(x), vx),
             Eq(der(y), vy),
+            # 2·(x, y) is the gradient of the constraint x² + y² − L².
             Eq(mass * der(vx), -2 * lam * x + mass * gx),
             Eq(mass * der(vy), -2 * lam * y + mass * gy),
             Eq(x**2 + y**2, length**2),

@@ -48,6 +48,7 @@ class Saturation(Component):
         super().__init__(ev, name)
         least, most = self.parameter("low", low), self.parameter("high", high)
         in_order(self, "low", "high")
+        # No events at the limits, where the output is continuous.
         self.output("y", smooth(Min(Max(self.input("u"), least), most)))
 
 

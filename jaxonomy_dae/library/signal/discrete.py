@@ -97,8 +97,10 @@ class SampledDelay(Component):
         T = self.parameter("period", period, unit="s", bounds=POSITIVE)
         start = self.parameter("initial_y", initial_y)
         u, y = self.input("u"), self.variable("y")
+        # One more than samples of delay: x0 is the sample of this tick.
         line = [self.discrete(f"x{k}", start=start) for k in range(samples + 1)]
         self.add_equations(Eq(y, line[-1]))
+        # All move at once: `pre` reads the line as it was before the tick.
         moved = [assign(later, pre(before)) for before, later in zip(line, line[1:], strict=False)]
         self.when(self.sampled(T), assign(line[0], u), *moved)
 
@@ -149,4 +151,5 @@ class Counter(Component):
         u, y = self.input("u"), self.variable("y", unit="1")
         count = self.discrete("count", unit="1")
         self.add_equations(Eq(y, count))
+        # Not at the start: an input that begins above the threshold has not risen.
         self.when(u > level, assign(count, pre(count) + 1))

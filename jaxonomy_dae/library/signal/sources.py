@@ -69,6 +69,7 @@ class Noise(Component):
         size = self.parameter("std", std, bounds=NONNEGATIVE)
 
         def value(t):
+            # The number of an interval seeds its value, so that no sequence is stored, and any time can be asked for.
             count = jnp.floor(t / interval)
             number = count.astype(jnp.int32)
             first, second = (jax.random.normal(jax.random.fold_in(key, number + k), dtype=t.dtype) for k in (0, 1))

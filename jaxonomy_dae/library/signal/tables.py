@@ -39,6 +39,7 @@ class _Place(eqx.Module):
 
     def __call__(self, u):
         x = jnp.asarray(self.x, u.dtype)
+        # Pieces are numbered by interpolation, whose kinks are at the points: `floor` of it changes there.
         return jnp.interp(u, x, jnp.arange(len(self.x), dtype=u.dtype), left="extrapolate", right="extrapolate")
 
 
@@ -49,6 +50,7 @@ class _Piece(eqx.Module):
     y: Float[Array, " n"]
 
     def __call__(self, u, piece):
+        # The piece is held between events, so that stages of a step that pass a point go on along one line.
         k = jnp.clip(piece, 0, len(self.x) - 2).astype(int)
         x = jnp.asarray(self.x, self.y.dtype)
         return self.y[k] + (self.y[k + 1] - self.y[k]) / (x[k + 1] - x[k]) * (u - x[k])

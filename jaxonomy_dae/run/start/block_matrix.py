@@ -142,6 +142,7 @@ class Block:
                 # What is zero moves by one: a part of zero would be no change.
                 moved[moving][:, k] += MOVED * np.where(unit[:, k] == 0.0, 1.0, unit[:, k])
                 change = np.where(inside, (_partials(own, moved, at) - before) * scales, 0.0)
+                # A slope that is no longer finite has changed without measure: what was moved counts as a cause.
                 change = np.where(np.isfinite(change), change, np.inf)
                 np.maximum.at(size, ids[:, k], np.abs(change).max(axis=1, initial=0.0))
                 with np.errstate(invalid="ignore"):

@@ -31,6 +31,7 @@ class Substitution(NamedTuple):
 @remembered
 def substitution(plan: SystemPlan, rows: InitialRows) -> Substitution | None:
     """The order in which unknowns follow from each other; None if they do not."""
+    # Tearing variables follow from nonlinear equations, which need a search.
     if len(plan.carried):
         return None
     known = {int(q): {k: 1.0} for k, q in enumerate(plan.states)}
@@ -49,6 +50,8 @@ def substitution(plan: SystemPlan, rows: InitialRows) -> Substitution | None:
     place = {int(q): k for k, q in enumerate(plan.states)}
     for k, start in enumerate(rows.kept):
         unknown = place.get(start.quantity)
+        # The first row of a state counts: values given stand before fixed starts, and these before guesses. Later ones
+        # are checked like all other rows.
         if unknown is not None and row[unknown] < 0:
             row[unknown], coefficient[unknown] = starts + k, start.factor
             level[unknown] = int(rows.guess[unknown] != start)  # the search begins at guesses

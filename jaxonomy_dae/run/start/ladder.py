@@ -305,5 +305,6 @@ def _inside(x: Numbers, low: Numbers, high: Numbers, known: Numbers) -> Numbers:
     xp = namespace(x)
     size = xp.maximum(known, xp.abs(x))
     width = xp.where(xp.isfinite(high - low), high - low, xp.where(size > 0, size, 1))
+    # Off the bounds for the reason of `TO_BOUND`: there the Jacobian may not be finite.
     margin = 1e-3 * width
     return xp.where(x <= low, low + margin, xp.where(x >= high, high - margin, x))

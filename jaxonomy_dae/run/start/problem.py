@@ -274,6 +274,7 @@ def _distances(plan: SystemPlan, rows: InitialRows, sizes: Any) -> Any:
     index, unit = plan.variable_index, plan.flat.variables.unit
     units = [unit[index[row.name]] if row.name in index else "" for row in soft]
     same = np.array([[a == b for b in units] for a in units])
+    # One distance for all guesses of a unit: by its own size, a small guess would weigh more than a large one.
     shared = jnp.max(jnp.where(same, sizes[-rows.n_soft :][None, :], 0), axis=1)
     factor = np.abs([row.factor for row in soft])
     nominal = jnp.asarray(factor * declared_scale(plan.model)[[row.quantity for row in soft]], sizes.dtype)

@@ -394,6 +394,7 @@ def _by_matching(plan: SystemPlan, generic: _Generic, hard: Sequence[StartRow], 
     column = match_in_order(pointer, columns, n_columns, n_equations)
     shares = _sharing(pointer, columns, column, n_equations + n, ranks, n_columns)
     matched, settled, unshared = column[n_equations:] >= 0, np.zeros(0, np.int64), np.zeros(len(guesses), bool)
+    # The point nearest to all guesses is found by dense algebra: with many unknowns each takes what is left, in order.
     if plan.n_state > DENSE_UPTO:
         shares, unshared = unshared, shares & ~matched[n:]
     missing = n_columns - n_equations - int(matched.sum())

@@ -129,6 +129,7 @@ def examine_blocks(
             blocks = blocks_of(step, np.flatnonzero(_are_suspicious(step, known))) if k in check.examined else ()
         for block in blocks:
             if step.whole and not step.carried:
+                # At zero the residual is the right-hand side, as in `_solve`.
                 known.put(block.unknown, 0.0)
             rank = block.rank(known)
             if rank is None:

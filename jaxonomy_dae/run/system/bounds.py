@@ -100,6 +100,8 @@ def unconstrained(x: Float[Array, "*n"], ends: Ends) -> Float[Array, "*n"]:
     an interval of one number."""
     is_point = ends.low == ends.high
     has_low, has_high = np.isfinite(ends.low) & ~is_point, np.isfinite(ends.high) & ~is_point
+    # Where an end is missing, one stands for the distance from it, so that its logarithm adds nothing. Two logarithms,
+    # not that of a ratio, which overflows next to an end.
     above = jnp.where(has_low, x - jnp.asarray(np.where(has_low, ends.low, 0), x.dtype), 1)
     below = jnp.where(has_high, jnp.asarray(np.where(has_high, ends.high, 0), x.dtype) - x, 1)
     bounded = jnp.log(above) - jnp.log(below)

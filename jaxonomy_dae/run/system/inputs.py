@@ -232,6 +232,7 @@ def interpolated(times: Float[Array, " n"], values: Float[Array, " n *shape"], k
         return SampledInput(diffrax.LinearInterpolation(times, values), 0)
     if kind == "spline":
         return SampledInput(natural_spline(times, values), 2)
+    # Slopes that look backwards: no value depends on samples that come after the interval it lies in.
     return SampledInput(diffrax.CubicInterpolation(times, diffrax.backward_hermite_coefficients(times, values)), 1)
 
 

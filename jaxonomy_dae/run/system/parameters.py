@@ -195,6 +195,7 @@ class Parameters(eqx.Module):
         if entries is not None:
             if not self.free_index:
                 return picked(self.array, (..., entries))
+            # One by one: entries of an array may stand in either part, and may be computed from others.
             parts = [self[self.table.names[k]] for k in entries.ravel().tolist()]
             return jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *entries.shape)
         k = self.table.index(name)

@@ -59,6 +59,7 @@ class Passes(Sections):
         yield Pass(
             "flatten",
             f"the equations of {counted(len(flat.components), 'component')} and of their connections",
+            # The plan's flat model is what the user's passes have left: flattening is shown as it was before them.
             self._given[0].before.n_equations if self._given else flat.n_equations,
             self._flattened,
         )

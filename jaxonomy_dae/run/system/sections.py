@@ -55,6 +55,7 @@ def folded(names: Sequence[str]) -> list[str]:
 def _as_one(names: list[str]) -> list[str]:
     places = [tuple(map(int, re.findall(r"\d+", " ".join(_INDEX.findall(name))))) for name in names]
     ranges = [range(min(column), max(column) + 1) for column in zip(*places, strict=True)]
+    # Whole ranges only: where one index is missing, a range would claim a name that the model does not have.
     if len(names) < 2 or len(set(places)) != math.prod(map(len, ranges)) or len(set(places)) != len(names):
         return names
     written = iter(f"{r[0]}…{r[-1]}" if len(r) > 1 else str(r[0]) for r in ranges)

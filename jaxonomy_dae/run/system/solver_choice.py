@@ -75,6 +75,8 @@ class Stiffness:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Stiffness):
             return False
+        # Equal parameters decay alike (all else that is static is compared beside this), so that most comparisons need
+        # no decade.
         return self is other or np.array_equal(self._asked[1], other._asked[1]) or self.decay == other.decay
 
     def __hash__(self) -> int:
@@ -116,8 +118,11 @@ def _fast_rates(matrix: Any, below: np.ndarray) -> np.ndarray:
     """The eigenvalues of largest size, by Arnoldi's method, in terms of free quantities among those `below`."""
     scaled, _, unit = equilibrated(matrix)
     free, changes = _changes(scaled, below)
+    # The quantity behind v in their order is v'.
     per, steps = unit[free + 1] / unit[free], min(len(free), KRYLOV)
     basis, hessenberg = np.zeros((steps + 1, len(free))), np.zeros((steps + 1, steps))
+    # Generic, so that it has a part along every eigenvector, and of a fixed seed: a model has the same solver on every
+    # run.
     basis[0] = np.random.default_rng(0).normal(size=len(free))
     basis[0] /= np.linalg.norm(basis[0])
     for k in range(steps):

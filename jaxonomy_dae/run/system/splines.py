@@ -20,5 +20,7 @@ def natural_spline(ts: Float[Array, " n"], ys: Float[Array, " n *shape"]) -> dif
         right = (6 * jnp.diff(slope, axis=0)).reshape(len(ts) - 2, -1)
         inner = jax.vmap(lambda b: lx.linear_solve(matrix, b, lx.Tridiagonal()).value, 1, 1)(right)
         bend = bend.at[1:-1].set(inner.reshape(len(ts) - 2, *ys.shape[1:]))
+    # By second derivatives y'': y + b·s + y''/2·s² + Δy''/(6h)·s³ from each sample on, with b such that the next sample
+    # is met.
     b = slope - h * (2 * bend[:-1] + bend[1:]) / 6
     return diffrax.CubicInterpolation(ts, ((bend[1:] - bend[:-1]) / (6 * h), bend[:-1] / 2, b, ys[:-1]))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...base.aliases import Time
-from ...base.errors import ModelError, nearest
+from ...base.errors import ModelError
 from ...base.tolerances import CONSISTENT
 from ...compile.diagnosis.wording import counted, some
 from ...compile.lowering.plan import SystemPlan
@@ -23,7 +23,6 @@ from ...host.cache import compiled
 from ...host.platform import precisely
 from ...host.staging import is_staged, is_traced, joined, on_device, picked
 from ...solve.linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
-from .bounds import constrained, unconstrained
 from .input_values import check_given
 from .inputs import check_range, read_inputs
 from .nonlinear import Refinement
@@ -31,6 +30,7 @@ from .parameters import Parameters
 from .solver_choice import Stiffness
 from .system_at import SystemAt
 from .traced_once import TracedOnce
+from .trained_numbers import at_free_numbers, free_numbers, is_trained, parameters_among
 
 
 class AcausalSystem(eqx.Module):
@@ -57,7 +57,7 @@ class AcausalSystem(eqx.Module):
     @property
     def states(self) -> list[str]:
         """The names of the differential states, in the order of the state array."""
-        return [self.plan.quantity_name[q] for q in self.plan.states]
+        return list(self.plan.state_names)
 
     @property
     def carried(self) -> list[str]:
@@ -179,20 +179,7 @@ class AcausalSystem(eqx.Module):
         - `ModelError` for a name that is neither, for a parameter that is computed from others, and for a value on a
             bound, which has no finite z (inside jit, z is then infinite).
         """
-        table = self.parameters.table
-        chosen = table.chosen(self._parameters_among(names))
-        out: dict[str, Any] = {n: eqx.filter(self.neural[n], eqx.is_inexact_array) for n in names if n in self.neural}
-        for name, entries in chosen.items():
-            z = out[name] = unconstrained(self.parameters[name], table.ends.take(entries))
-            if not is_traced(z) and not np.isfinite(z).all():
-                places = np.broadcast_to(entries, np.shape(z))[~np.isfinite(z)]
-                one, interval = table.names[places[0]], table.intervals[places[0]]
-                raise ModelError(
-                    f"parameter '{one}' lies on the end of its bounds {interval}, or outside, where no free number "
-                    "belongs to it: start inside, with system.with_parameters, or let learning.Problem or "
-                    "learning.minimize train it, which can leave an end and reach it"
-                )
-        return {name: out[name] for name in names}
+        return free_numbers(self.parameters, self.neural, names)
 
     def constrain(self, free: Mapping[str, Any]) -> "AcausalSystem":
         """The system with the parameters that belong to the free numbers of `unconstrain`. Every free number, traced or
@@ -202,29 +189,9 @@ class AcausalSystem(eqx.Module):
 
         - `ModelError` for a name that is neither a parameter nor a network, and for wrong shapes.
         """
-        table = self.parameters.table
-        dtype = self.parameters.values.dtype
-        chosen = table.chosen(self._parameters_among(tuple(free)))
-        values = {name: constrained(jnp.asarray(free[name], dtype), table.ends.take(k)) for name, k in chosen.items()}
+        values, networks = at_free_numbers(self.parameters, self.neural, free)
         system = self.with_parameters(values)
-        networks = {n: eqx.combine(free[n], self.neural[n]) for n in free if n in self.neural}
         return eqx.tree_at(lambda s: s.neural, system, self.neural | networks) if networks else system
-
-    def _parameters_among(self, names: Sequence[str]) -> tuple[str, ...]:
-        """The names that are not of networks.
-
-        **Raises:**
-
-        - `ModelError` for a name that is neither a network nor a parameter.
-        """
-        chosen = tuple(n for n in dict.fromkeys(names) if n not in self.neural)
-        for name in chosen:
-            if name not in self.parameters:
-                raise ModelError(
-                    f"'{name}' is neither a network nor a parameter: "
-                    + nearest(name, [*self.neural, *self.parameters.names])
-                )
-        return chosen
 
     def partition(self, *names: str) -> tuple["AcausalSystem", "AcausalSystem"]:
         """Separates the trained numbers: returns `(trainable, frozen)`, which `equinox.combine` joins again.
@@ -236,19 +203,9 @@ class AcausalSystem(eqx.Module):
 
         - `ModelError` for a name that is neither.
         """
-        chosen_networks = {n for n in names if n in self.neural}
-        chosen_parameters = self._parameters_among(names)
-        system = eqx.tree_at(lambda s: s.parameters, self, self.parameters.freed(chosen_parameters))
-        wanted = jax.tree.map(lambda _: False, system)
-        if chosen_parameters:
-            wanted = eqx.tree_at(lambda s: s.parameters.free, wanted, True)
-        if chosen_networks:
-            flags = {
-                n: jax.tree.map(eqx.is_inexact_array, w) if n in chosen_networks else wanted.neural[n]
-                for n, w in system.neural.items()
-            }
-            wanted = eqx.tree_at(lambda s: s.neural, wanted, flags)
-        return eqx.partition(system, wanted)
+        chosen = parameters_among(self.parameters, self.neural, names)
+        system = eqx.tree_at(lambda s: s.parameters, self, self.parameters.freed(chosen))
+        return eqx.partition(system, is_trained(system, bool(chosen), {n for n in names if n in self.neural}))
 
     def merged(self) -> "AcausalSystem":
         """This system with trainable and frozen parts joined again."""
