@@ -10,7 +10,6 @@ from pathlib import Path
 
 from ..host.kept import make_room
 
-
 OURS = re.compile(r"[0-9a-f]{64}(\.gz)?|new-[\w-]+")  # names of files that this module wrote
 ROOM = 2**28  # bytes in one folder: the 1,343 classes of the Modelica library take some 15 MB
 
