@@ -88,12 +88,14 @@ class OpenComponent(FlatComponent):
         return super().variable(name, **declared)
 
     def _show_ports(self) -> None:
-        """Ports as attributes: also where a component has a method of that name; arrays of connectors as tuples."""
+        """Ports as attributes: also where a component has a method of that name; arrays of connectors as tuples. Those
+        of fluids are called `ports`, as the mapping of all ports, which stays."""
         nested: dict[str, Any] = {}
         for name, port in self.ports.items():
             nested.setdefault(name.partition("[")[0].partition(".")[0], []).append(port)
         for top, ports in nested.items():
-            object.__setattr__(self, top, ports[0] if ports[0].name == top else tuple(ports))
+            if top not in self.__dict__:
+                object.__setattr__(self, top, ports[0] if ports[0].name == top else tuple(ports))
 
 
 def _with_start(d: Declaration, start: Expression) -> Declaration:
