@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import sympy
+from sympy.core.relational import Relational
 from sympy.functions.elementary.piecewise import ExprCondPair
 
 from ..base.aliases import Expression
@@ -39,6 +40,8 @@ def exchanged(value: Any, new: Mapping[Any, Any]) -> Any:
                 known[e] = sympy.Tuple.__new__(ExprCondPair, *parts)
             elif isinstance(e, sympy.Piecewise):
                 known[e] = by_conditions(*(pair.args for pair in parts))
+            elif isinstance(e, Relational):  # SymPy would look into branches for a sign
+                known[e] = e.func(*parts, evaluate=all(part.is_Number for part in parts))
             else:
                 known[e] = e.func(*parts)
         return known[e]
