@@ -23,6 +23,7 @@ class Partials(NamedTuple):
     - `slopes`, `outputs`: dx/dt and y.
     - `of_slopes`, `of_constraints`, `of_outputs`: their derivatives, and those of hidden constraints, with respect to
         states, inputs and the discrete values that clocks write.
+    - `off`: which hidden constraints do not hold at the point.
     - `agree`: whether all of it is the same on both sides of events at whose levels the point lies; `near`: which
         events these are.
     """
@@ -32,6 +33,7 @@ class Partials(NamedTuple):
     of_slopes: tuple[Array, Array, Array]
     of_constraints: tuple[Array, Array, Array]
     of_outputs: tuple[Array, Array, Array]
+    off: Array
     agree: Array
     near: Array
 
@@ -76,17 +78,28 @@ def partials_at(system: AcausalSystem, point: Driven, quantity: tuple[int, ...],
         return jax.jacfwd(twice, (0, 1, 2), has_aux=True)(x[:n], u, q[sampled])
 
     if events is None or not len(system.plan.events or ()):
-        (of_slopes, of_constraints, of_outputs), (slopes, _, y) = of(q)
-        return Partials(slopes, y, of_slopes, of_constraints, of_outputs, jnp.array(True), jnp.zeros(0, bool))
+        (of_slopes, of_constraints, of_outputs), (slopes, left, y) = of(q)
+        off = _off(system, point, left)
+        return Partials(slopes, y, of_slopes, of_constraints, of_outputs, off, jnp.array(True), jnp.zeros(0, bool))
     sides, near = both_sides(system, t, values, events, x, q)
     # The first side is the point itself, whose derivatives are taken; the others are compared with it.
     on_sides = jax.vmap(of)(sides.at[0].set(q))
-    (of_slopes, of_constraints, of_outputs), (slopes, _, y) = jax.tree.map(lambda a: a[0], on_sides)
-    agree = jnp.stack([_alike(leaf) for leaf in jax.tree.leaves(on_sides)]).all()
-    return Partials(slopes, y, of_slopes, of_constraints, of_outputs, agree & ~_moves(system.plan, near), near)
+    (of_slopes, of_constraints, of_outputs), (slopes, left, y) = jax.tree.map(lambda a: a[0], on_sides)
+    agree = jnp.stack([alike(leaf) for leaf in jax.tree.leaves(on_sides)]).all()
+    agree, off = agree & ~_moves(system.plan, near), _off(system, point, left)
+    return Partials(slopes, y, of_slopes, of_constraints, of_outputs, off, agree, near)
 
 
-def _alike(sides: Array) -> Array:
+def _off(system: AcausalSystem, point: Driven, left: Array) -> Array:
+    """Which hidden constraints do not hold, to half of the digits of their terms; `left` is what is left of them. A
+    point may have been found for other parameters."""
+    here = system.holding(point.q).at(point.t, {**point.values, **dict(zip(point.inputs, point.u, strict=True))})
+    places = np.concatenate([system.plan.states, system.plan.carried]).astype(np.int64)
+    reach = jnp.maximum(jnp.abs(point.x), system.typical_sizes[places])
+    return jnp.abs(left) > spacing(left.dtype) ** 0.5 * here.constraint_magnitudes(point.x, reach)
+
+
+def alike(sides: Array) -> Array:
     """Whether rows are the same, to half of the digits of the largest entry."""
     # Branches that meet with one slope differ by rounding alone. Kinks differ by parts of order one.
     allowed = spacing(sides.dtype) ** 0.5 * jnp.max(jnp.abs(sides), initial=0.0)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
+from numpy.typing import ArrayLike
 
 from ..base.errors import ModelError
 from ..base.optional import optional_module
@@ -53,7 +54,7 @@ class StateSpace(eqx.Module):
         slowness = found.real if self.dt is None else jnp.abs(found)
         return found[jnp.lexsort((found.imag, -found.real, -slowness))]
 
-    def frequency_response(self, omega: object) -> FrequencyResponse:
+    def frequency_response(self, omega: ArrayLike) -> FrequencyResponse:
         """The response to sinusoids, C·(jω − A)⁻¹·B + D. A discrete-time model has exp(jω·dt) in place of jω, and
         responds from samples of inputs to samples of outputs.
 
@@ -63,10 +64,20 @@ class StateSpace(eqx.Module):
 
         **Returns:**
 
-        A `FrequencyResponse`, `response["output", "input"]` of shape `(k,)`. At a pole on the imaginary axis it is
-        infinite or not-a-number.
+        A `FrequencyResponse`, `response["output", "input"]` of shape `(k,)`. At a frequency where A has a pole, as at
+        ω = 0 with an integrator or with the angle of a free shaft among the states, all pairs are infinite or
+        not-a-number, also those that do not see the pole: take a small frequency instead.
+
+        **Raises:**
+
+        - `ModelError` for frequencies that are no row of real numbers.
         """
-        omega = jnp.atleast_1d(jnp.asarray(omega, self.A.dtype))
+        given = jnp.asarray(omega)
+        if jnp.iscomplexobj(given) or given.ndim > 1:
+            raise ModelError(
+                f"omega is a row of real angular frequencies (rad/s); got {given.dtype} of shape {given.shape}"
+            )
+        omega = jnp.atleast_1d(given.astype(self.A.dtype))
         a, b, c, d = (m.astype(_complex(m)) for m in (self.A, self.B, self.C, self.D))
         eye = jnp.eye(len(self.states), dtype=a.dtype)
 

@@ -29,6 +29,19 @@ def finite(values: object, name: str, what: str) -> np.ndarray:
     return found
 
 
+def coefficients(values: object, name: str, what: str) -> np.ndarray:
+    """An array of numbers in one row; one number is a row, too.
+
+    **Raises:**
+
+    - `ModelError` if they are not, or if one of them is not finite.
+    """
+    found = np.atleast_1d(finite(values, name, what))
+    if found.ndim != 1:
+        raise ModelError(f"'{name}': {what} is one row of coefficients; got shape {found.shape}")
+    return found
+
+
 def increasing(values: object, name: str, what: str) -> np.ndarray:
     """An array of at least two increasing points.
 

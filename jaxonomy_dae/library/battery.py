@@ -63,11 +63,11 @@ class _CellData(NamedTuple):
         if len(ocv) != len(points):
             raise ModelError(f"'{name}': ocv has {len(ocv)} entries, soc has {len(points)}: they must agree")
         starts = None if self.initial_voltage is None else row(self.initial_voltage, name, "initial_voltage")
-        voltages = len(R) if starts is None else len(starts)
-        if not len(R) == len(C) == voltages:
+        if len(R) != len(C) or (starts is not None and len(starts) != len(R)):
+            voltages = "no initial_voltage" if starts is None else f"{len(starts)} in initial_voltage"
             raise ModelError(
                 f"'{name}' needs a resistance, a capacity and, if given, a voltage for each RC pair; got {len(R)} in "
-                f"R, {len(C)} in C and {voltages} in initial_voltage"
+                f"R, {len(C)} in C and {voltages}"
             )
         known_kind(self.kind, name)
         return self._replace(soc=points, ocv=ocv, R=R, C=C, initial_voltage=starts)

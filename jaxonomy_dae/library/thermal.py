@@ -121,11 +121,13 @@ class Wall(Component):
         R, C = row(R, name, "R"), row(C, name, "C")
         n = len(R)
         given: Any = initial_temperature
-        starts = row(given, name, "initial_temperature") if np.ndim(given) else [given] * n
+        several = bool(np.ndim(given))
+        starts = row(given, name, "initial_temperature") if several else [given] * n
         if n == 0 or not n == len(C) == len(starts):
+            temperatures = f" and {len(starts)} in initial_temperature" if several else ""
             raise ModelError(
                 f"wall '{name}' needs a resistance, a capacity and, if given, a temperature for each layer; got {n} in "
-                f"R, {len(C)} in C and {len(starts)} in initial_temperature"
+                f"R, {len(C)} in C{temperatures}"
             )
         r = [self.parameter(f"R{k}", value, unit="K/W", bounds=POSITIVE) for k, value in enumerate(R, start=1)]
         c = [self.parameter(f"C{k}", value, unit="J/K", bounds=POSITIVE) for k, value in enumerate(C, start=1)]

@@ -91,6 +91,11 @@ def numbers(name: str) -> Callable[..., Numeric]:
     step, count = GENERATORS[name]
 
     def function(*state: Numeric) -> Numeric:
+        if jnp.result_type(float) != jnp.float64:
+            raise ModelError(
+                f"the random generator {name} computes with integers of 64 bits: "
+                'jax.config.update("jax_enable_x64", True)'
+            )
         whole = [jnp.asarray(s).astype(jnp.int64) for s in state]
         # A half may be negative. Cut to 32 bits it keeps its own bits, and does not fill those of the other half with
         # ones.

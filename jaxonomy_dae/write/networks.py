@@ -80,7 +80,7 @@ def check_kind(network: object, kind: Any, where: str) -> None:
 
 def _on_device(leaf: PyTree) -> PyTree:
     """A NumPy array as one of JAX; with its type, for which `asarray` compiles no program."""
-    return jnp.asarray(leaf, jnp.result_type(leaf.dtype)) if isinstance(leaf, np.ndarray) else leaf
+    return jnp.asarray(leaf, jax.dtypes.canonicalize_dtype(leaf.dtype)) if isinstance(leaf, np.ndarray) else leaf
 
 
 class OfScalars(eqx.Module):

@@ -29,6 +29,7 @@ OCV = np.array([3.0, 3.45, 3.58, 3.7, 3.97, 4.19])
     [
         (lambda ev: el.Diode(ev, "d", Is=-1e-9), r"d\.Is"),
         (lambda ev: el.MutualInductor(ev, "m", L1=0.0), r"m\.L1"),
+        (lambda ev: el.MutualInductor(ev, "m", L1=2.0, L2=0.5, M=-1.0), r"'m': M² must be below L1·L2; got M=-1"),
         (lambda ev: el.HeatedResistor(ev, "r", R=-2.0), r"r\.R"),
         (lambda ev: el.PulseVoltage(ev, "p", period=0.0), r"p\.period"),
     ],
@@ -58,7 +59,7 @@ def test_mechanical(make, named):
         (lambda ev: Convection(ev, "c", A=-1.0), r"'c\.A' must lie in \[0, inf\); got -1"),
         (lambda ev: Radiation(ev, "r", eps=1.2), r"'r\.eps' must lie in \[0, 1\]; got 1\.2"),
         (lambda ev: Wall(ev, "w", [1.0, -2.0], [1.0, 1.0]), r"'w\.R2' must lie in \(0, inf\); got -2"),
-        (lambda ev: Wall(ev, "w", [1.0, 2.0], [1.0]), r"wall 'w' needs .*got 2 in R, 1 in C and 2 in initial_temp"),
+        (lambda ev: Wall(ev, "w", [1.0, 2.0], [1.0]), r"wall 'w' needs .*got 2 in R, 1 in C$"),
         (lambda ev: Wall(ev, "w", [], []), r"wall 'w' needs .*got 0 in R"),
     ],
 )
@@ -77,6 +78,13 @@ def test_thermal(make, message):
         (lambda ev: sig.Table2D(ev, "t", [0, 1], [0, 1], [[1, 2]]), r"'t': values has shape \(1, 2\)"),
         (lambda ev: sig.TransferFunction(ev, "f", [1, 0], [2]), r"'f': the numerator's degree, 1, is above"),
         (lambda ev: sig.StateSpace(ev, "s", [[1, 0]], [[1]], [[1]]), r"'s': A has shape \(1, 2\)"),
+        (
+            lambda ev: sig.StateSpace(ev, "s", np.eye(2), [0, 1], [1, 0]),
+            r"B has shape \(1, 2\), expected \(2, 1\): one",
+        ),
+        (lambda ev: sig.TransferFunction(ev, "f", [[1, 0]], [2, 1]), r"'f': numerator is one row.*shape \(1, 2\)"),
+        (lambda ev: sig.DiscreteTransferFunction(ev, "f", [1], [[2, 1]]), r"'f': denominator is one row"),
+        (lambda ev: sig.Hysteresis(ev, "h", initially_on="no"), "'h': initially_on is True or False; got 'no'"),
         (lambda ev: sig.FirstOrder(ev, "f", T=0.0), r"f\.T"),
     ],
 )
@@ -121,7 +129,7 @@ def test_networks_of_fluids():
         (lambda ev: Cell(ev, "c", SOC, OCV, Q=-1.0), r"'c\.Q' must lie in \(0, inf\); got -1"),
         (lambda ev: Cell(ev, "c", SOC, OCV, R0=0.0), r"'c\.R0' must lie in \(0, inf\); got 0"),
         (lambda ev: Cell(ev, "c", SOC, OCV, R=[0.1], C=[0.0]), r"'c\.C1' must lie in \(0, inf\); got 0"),
-        (lambda ev: Cell(ev, "c", SOC, OCV, R=[0.1, 0.2], C=[1.0]), r"'c' needs .*got 2 in R, 1 in C and 2 in initial"),
+        (lambda ev: Cell(ev, "c", SOC, OCV, R=[0.1, 0.2], C=[1.0]), r"'c' needs .*got 2 in R, 1 in C and no initial_v"),
         (lambda ev: Cell(ev, "c", SOC, OCV, eta=1.1), r"'c\.eta' must lie in \(0, 1\]; got 1\.1"),
         (lambda ev: HeatedCell(ev, "c", SOC, OCV, T_ref=0.0), r"'c\.T_ref' must lie in \(0, inf\); got 0"),
         (lambda ev: Pack(ev, "k", 0, 2, SOC, OCV), r"'k': series must be at least 1, an integer; got 0"),

@@ -14,6 +14,7 @@ from sympy import Eq
 from trajectories import solution_of
 
 import jaxonomy_dae.library.electrical as el
+import jaxonomy_dae.library.planar as pl
 import jaxonomy_dae.library.thermal as th
 import jaxonomy_dae.library.translational as tr
 from jaxonomy_dae import (
@@ -398,6 +399,8 @@ def test_arguments_of_linearize():
     with pytest.raises(ModelError, match=r"the model differentiates input 'shaker\.u'.*lag"):
         linearize(driven, {"shaker.u": 0.0}, ["mass.v"])
     response = frequency_response(motor(), inputs={"source.u": 0.0}, outputs=["motor.rotor.w"], omega=[1.0])
+    with pytest.raises(ModelError, match=r"omega is a row of real .*got complex128 of shape \(1,\)"):
+        frequency_response(motor(), inputs={"source.u": 0.0}, outputs=["motor.rotor.w"], omega=[1.0j])
     with pytest.raises(ModelError, match=r"'source\.u' is not an output"):
         response["source.u", "motor.rotor.w"]
     with pytest.raises(ModelError, match=r"two names, response\['output', 'input'\]"):
@@ -412,6 +415,31 @@ def test_a_state_space_is_shown():
     assert "<th>motor.rotor.w</th>" in html and html.count("<table>") == 4
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), space)
     assert repr(batch).startswith("StateSpace(3 states")
+
+
+def test_a_point_of_another_pendulum():
+    """A point of a pendulum of one metre is none of one of four; its poles are ±j·√(g/4)."""
+    system = compiled(pl.PlanarPendulum(EqnEnv(), "pend", initial_theta=-1.5))
+    at, longer = steady_state(system), system.with_parameters({"pend.L": 4.0})
+    with pytest.raises(ModelError, match=r"not one of this system: .*pend.* does not hold there.*same parameters"):
+        linearize(longer, [], ["pend.x"], at=at)
+    poles = linearize(longer, [], ["pend.x"], at=steady_state(longer)).poles()
+    np.testing.assert_allclose(np.sort(poles.imag), np.sqrt(9.81 / 4) * np.array([-1, 1]), rtol=1e-9)
+
+
+def test_one_of_many_equilibria():
+    """Two bodies that radiate to each other rest at any common temperature T, with the pole −4·sigma·T³·(1/C1 + 1/C2):
+    a linear model that a search chose was that of 322 K for bodies that end at 375 K."""
+    ev = EqnEnv()
+    a, b = th.HeatCapacitor(ev, "a", 100.0, 300.0), th.HeatCapacitor(ev, "b", 300.0, 400.0)
+    gap = th.Radiation(ev, "gap", eps=1.0)
+    system = compiled(a, b, gap, connect=[(a.heat, gap.port_a), (b.heat, gap.port_b)])
+    with pytest.raises(SteadyStateError, match=r"one of many: .*a common change of a\.T, b\.T.*drifting=\['a\.T'\]"):
+        linearize(system, [], ["gap.Q_flow"])
+    at = steady_state(system.with_parameters({"a.initial_temperature": 375.0}), drifting=["a.T"])
+    poles = linearize(system, [], ["gap.Q_flow"], at=at).poles()
+    expected = [0.0, -4 * th.STEFAN_BOLTZMANN * 375.0**3 * (1 / 100 + 1 / 300)]
+    np.testing.assert_allclose(poles, expected, rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.slow

@@ -577,7 +577,9 @@ def sampling():
     blocks = [
         sig.SampleHold(ev, "hold", T, initial_y=7.0), sig.SampledDelay(ev, "late", 3, T, initial_y=0.4),
         sig.DiscreteTransferFunction(ev, "tf", NUMERATOR, DENOMINATOR, T),
-        sig.DiscretePI(ev, "pi", 2.0, 3.0, T), sig.DiscretePI(ev, "bounded", 2.0, 3.0, T, low=-0.8, high=1.0),
+        sig.DiscretePI(ev, "pi", 2.0, 3.0, T, high=np.inf),
+        sig.DiscretePI(ev, "bounded", 2.0, 3.0, T, low=-0.8, high=1.0),
+        sig.DiscretePI(ev, "reverse", -2.0, -3.0, T, low=-1.0, high=0.8),
         sig.Counter(ev, "count", 0.5), sig.Hysteresis(ev, "relay", -0.3, 0.6, low=-2.0, high=5.0),
     ]  # fmt: skip
     clock = sig.Integrator(ev, "nothing")
@@ -596,7 +598,7 @@ def sampling():
         sig.SampleHold: ("the samples", "hold.y"),
         sig.SampledDelay: ("the samples, later", "late.y"),
         sig.DiscreteTransferFunction: ("SciPy's dlsim", "tf.y"),
-        sig.DiscretePI: ("a loop over the samples", "pi.y", "bounded.y"),
+        sig.DiscretePI: ("a loop over the samples", "pi.y", "bounded.y", "reverse.y"),
         sig.Counter: ("arcsin of the threshold", "count.y"),
         sig.Hysteresis: ("a loop over fine samples", "relay.y"),
     },
@@ -622,7 +624,7 @@ def test_sampled_blocks():
     # Sampled values are sums of a few hundred roundings.
     for name, expected in {
         "hold": u, "late": np.concatenate([[0.4] * 3, u[:-3]]), "tf": filtered[:, 0], "pi": 2.0 * u + total,
-        "bounded": bounded, "count": rises, "relay": relay[20::40],
+        "bounded": bounded, "reverse": -np.array(bounded), "count": rises, "relay": relay[20::40],
     }.items():  # fmt: skip
         measured(f"{name}.y", found.values(f"{name}.y", ts), expected, 1e-12 * max(1.0, np.abs(expected).max()))
     np.testing.assert_allclose(found.values("wave.y", ts), np.sin(3 * ts), atol=1e-12)

@@ -110,6 +110,13 @@ def loop(k, law=None):
 
 
 @pytest.mark.slow
+def test_the_values_of_tables_are_trained_and_not_their_points():
+    ev = EqnEnv()
+    system = compiled(sig.Table1D(ev, "line", X, VALUES), sig.Table2D(ev, "map", X, [0.0, 1.0, 2.0], GRID))
+    trained = jax.tree.leaves(system.partition("line.table", "map.table")[0])
+    assert sorted(leaf.shape for leaf in trained) == [VALUES.shape, GRID.shape]
+
+
 def test_loops_without_memory_are_solved():
     linear = loop(4.0)
 

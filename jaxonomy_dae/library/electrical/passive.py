@@ -2,6 +2,7 @@
 
 from sympy import Min, exp
 
+from ...base.errors import ModelError
 from ...write import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Thermal, Value, der, smooth
 from ..arguments import start_of
 from .two_pin import TwoPin, TwoPorts
@@ -22,7 +23,8 @@ class HeatedResistor(TwoPin):
     """A resistor that changes with its temperature and heats what it touches: v = R·(1 + alpha·(T − T_ref))·i, the heat
     v·i leaves at the port `heat`.
 
-    `R` > 0 in ohm at `T_ref` (kelvin), `alpha` in 1/kelvin, `T` the temperature of the port.
+    `R` > 0 in ohm at `T_ref` (kelvin), `alpha` in 1/kelvin, `T` the temperature of the port. `T_ref` is a guess of it:
+    beside radiation there may be solutions below zero kelvin, too.
     """
 
     def __init__(self, ev: EqnEnv, name: str, R: Value = 1.0, alpha: Value = 0.0, T_ref: Value = 293.15):
@@ -32,8 +34,11 @@ class HeatedResistor(TwoPin):
         reference = self.parameter("T_ref", T_ref, unit="K")
         voltage, current = self._two_pins()
         heat = self.port("heat", Thermal)
+        T = self.variable("T", start=reference, unit="K")
         self.add_equations(
-            Eq(voltage, r * (1 + slope * (heat.T - reference)) * current), Eq(heat.Q_flow, -voltage * current)
+            Eq(T, heat.T),
+            Eq(voltage, r * (1 + slope * (T - reference)) * current),
+            Eq(heat.Q_flow, -voltage * current),
         )
 
 
@@ -62,8 +67,12 @@ class Inductor(TwoPin):
 class MutualInductor(TwoPorts):
     """Two coupled coils: v1 = L1·di1/dt + M·di2/dt, v2 = M·di1/dt + L2·di2/dt.
 
-    `L1`, `L2` > 0 and the mutual inductance `M` in henry, M² < L1·L2. Given initial currents (ampere) hold at the
-    start.
+    `L1`, `L2` > 0 and the mutual inductance `M` in henry, M² < L1·L2: else the coils would store negative energy. Given
+    initial currents (ampere) hold at the start.
+
+    **Raises:**
+
+    - `ModelError` for numbers with M² ≥ L1·L2.
     """
 
     def __init__(
@@ -80,6 +89,13 @@ class MutualInductor(TwoPorts):
         first = self.parameter("L1", L1, unit="H", bounds=POSITIVE)
         second = self.parameter("L2", L2, unit="H", bounds=POSITIVE)
         mutual = self.parameter("M", M, unit="H")
+        own1, own2, shared = (self.parameters[k].value for k in ("L1", "L2", "M"))
+        if isinstance(own1, float) and isinstance(own2, float) and isinstance(shared, float):
+            if shared**2 >= own1 * own2:
+                raise ModelError(
+                    f"'{name}': M² must be below L1·L2; got M={shared:g} with L1={own1:g} and L2={own2:g}: for coils "
+                    "that share all of their flux, take IdealTransformer, with an Inductor beside one of its sides"
+                )
         given = ("1", initial_current1), ("2", initial_current2)
         starts = {f"i{k}": start_of(self, f"initial_current{k}", start, "A") for k, start in given}
         v1, i1, v2, i2 = self._two_ports(**starts)

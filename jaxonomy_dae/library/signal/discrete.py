@@ -1,17 +1,18 @@
 """Blocks that act at instants: sampled controllers, and relays. Inputs are `u`, outputs `y`."""
 
+import math
 from collections.abc import Sequence
 
-import numpy as np
 import sympy
 
 from ...base.errors import ModelError
 from ...write import POSITIVE, Component, Eq, EqnEnv, Value, assign, pre
-from ..arguments import count, finite, in_order
+from ..arguments import coefficients, count, in_order, yes_or_no
 
 
 class SampleHold(Component):
-    """y is the input `u` as it was at the last of the instants 0, period, 2·period, … (second)."""
+    """y is the input `u` as it was at the last of the instants 0, period, 2·period, … (second); before the first of
+    them in a run it is `initial_y`."""
 
     def __init__(self, ev: EqnEnv, name: str, period: Value = 0.1, initial_y: Value = 0.0):
         super().__init__(ev, name)
@@ -25,30 +26,37 @@ class SampleHold(Component):
 
 class DiscretePI(Component):
     """A sampled controller: every `period` (second), y = kp·u + I with I the sum of ki·period·u so far, bounded by
-    `low` and `high`; the sum waits while y is at a bound and u drives it further."""
+    `low` and `high` where they are given; the sum waits while y is beyond a bound and ki·u drives it further. Gains may
+    be negative. y is 0 before the first tick."""
 
     def __init__(
         self, ev: EqnEnv, name: str, kp: Value = 1.0, ki: Value = 1.0, period: Value = 0.1,
-        low: Value = -sympy.oo, high: Value = sympy.oo,
+        low: Value | None = None, high: Value | None = None,
     ):  # fmt: skip
         super().__init__(ev, name)
         proportional, integral = self.parameter("kp", kp), self.parameter("ki", ki)
         T = self.parameter("period", period, unit="s", bounds=POSITIVE)
         u, y = self.input("u"), self.variable("y")
         held, total = self.discrete("held"), self.discrete("total")
-        wished = proportional * u + pre(total)
+        wished, grows = proportional * u + pre(total), integral * u
         bounded, free = wished, sympy.true
-        if high is not sympy.oo:
+        low, high = _finite(low, -math.inf), _finite(high, math.inf)
+        if high is not None:
             top = self.parameter("high", high)
-            bounded, free = sympy.Min(bounded, top), sympy.And(free, sympy.Or(wished <= top, u <= 0))
-        if low is not -sympy.oo:
+            bounded, free = sympy.Min(bounded, top), sympy.And(free, sympy.Or(wished <= top, grows <= 0))
+        if low is not None:
             bottom = self.parameter("low", low)
-            bounded, free = sympy.Max(bounded, bottom), sympy.And(free, sympy.Or(wished >= bottom, u >= 0))
-        if high is not sympy.oo and low is not -sympy.oo:
+            bounded, free = sympy.Max(bounded, bottom), sympy.And(free, sympy.Or(wished >= bottom, grows >= 0))
+        if high is not None and low is not None:
             in_order(self, "low", "high")
         self.add_equations(Eq(y, held))
-        step = sympy.Piecewise((integral * T * u, free), (0, True))
+        step = sympy.Piecewise((T * grows, free), (0, True))
         self.when(self.sampled(T), assign(held, bounded), assign(total, pre(total) + step))
+
+
+def _finite(bound: Value | None, none: float) -> Value | None:
+    """The bound; None for the infinite one that does not bound anything."""
+    return None if isinstance(bound, float | sympy.Basic) and bound == none else bound
 
 
 class DiscreteTransferFunction(Component):
@@ -64,8 +72,8 @@ class DiscreteTransferFunction(Component):
         self, ev: EqnEnv, name: str, numerator: Sequence[float], denominator: Sequence[float], period: Value = 0.1
     ):
         super().__init__(ev, name)
-        below, above = finite(denominator, name, "denominator"), finite(numerator, name, "numerator")
-        denominator, numerator = np.atleast_1d(below).tolist(), np.atleast_1d(above).tolist()
+        below, above = coefficients(denominator, name, "denominator"), coefficients(numerator, name, "numerator")
+        denominator, numerator = below.tolist(), above.tolist()
         n = len(denominator) - 1
         if n < 0 or denominator[0] == 0 or not 0 < len(numerator) <= n + 1:
             raise ModelError(
@@ -89,7 +97,8 @@ class DiscreteTransferFunction(Component):
 
 
 class SampledDelay(Component):
-    """y is the input as it was `samples` periods (second) ago; `initial_y` until then."""
+    """Every `period` (second), y becomes what the input `u` was `samples` ticks ago; until a run has had as many, it is
+    `initial_y`."""
 
     def __init__(self, ev: EqnEnv, name: str, samples: int = 1, period: Value = 0.1, initial_y: Value = 0.0):
         super().__init__(ev, name)
@@ -120,7 +129,7 @@ class Hysteresis(Component):
         in_order(self, "lower", "upper")
         least, most = self.parameter("low", low), self.parameter("high", high)
         u, y = self.input("u"), self.variable("y")
-        on = self.discrete("on", start=int(initially_on), unit="1")
+        on = self.discrete("on", start=yes_or_no(initially_on, name, "initially_on"), unit="1")
         self.add_equations(Eq(y, least + (most - least) * on))
         self.when(u > up, assign(on, 1), at_start=True)
         self.when(u < down, assign(on, 0), at_start=True)

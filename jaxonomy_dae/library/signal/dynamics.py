@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from ...base.errors import ModelError
 from ...write import POSITIVE, Component, Eq, EqnEnv, Value, der
-from ..arguments import count, finite, row, start_of
+from ..arguments import coefficients, count, finite, row, start_of
 
 
 class Integrator(Component):
@@ -86,9 +86,15 @@ class StateSpace(Component):
         a, b, c = (np.atleast_2d(finite(m, name, what)) for what, m in (("A", A), ("B", B), ("C", C)))
         n, m, p = a.shape[0], b.shape[1], c.shape[0]
         d = np.zeros((p, m)) if D is None else np.atleast_2d(finite(D, name, "D"))
-        for what, matrix, shape in (("A", a, (n, n)), ("B", b, (n, m)), ("C", c, (p, n)), ("D", d, (p, m))):
+        for what, matrix, shape in (
+            ("A", a, (n, n)),
+            ("B", b, (n, 1 if np.ndim(B) == 1 and n > 1 else m)),
+            ("C", c, (p, n)),
+            ("D", d, (p, m)),
+        ):
             if matrix.shape != shape:
-                raise ModelError(f"'{name}': {what} has shape {matrix.shape}, expected {shape}")
+                column = ": one input's column is [[b1], [b2], …]" if what == "B" and np.ndim(B) == 1 else ""
+                raise ModelError(f"'{name}': {what} has shape {matrix.shape}, expected {shape}{column}")
         starts = [0.0] * n if initial_x is None else row(initial_x, name, "initial_x")
         if len(starts) != n:
             raise ModelError(f"'{name}': initial_x has {len(starts)} entries, expected {n}")
@@ -109,8 +115,8 @@ class TransferFunction(Component):
 
     def __init__(self, ev: EqnEnv, name: str, numerator: ArrayLike, denominator: ArrayLike):
         super().__init__(ev, name)
-        top = np.atleast_1d(finite(numerator, name, "numerator"))
-        bottom = np.atleast_1d(finite(denominator, name, "denominator"))
+        top = coefficients(numerator, name, "numerator")
+        bottom = coefficients(denominator, name, "denominator")
         if not len(top):
             raise ModelError(f"'{name}': the numerator needs at least one coefficient; got none")
         if not len(bottom) or bottom[0] == 0.0:

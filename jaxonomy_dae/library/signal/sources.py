@@ -62,7 +62,7 @@ class Noise(Component):
 
     def __init__(self, ev: EqnEnv, name: str, key: jax.Array, std: Value = 1.0, interval: float = 1.0):
         super().__init__(ev, name)
-        if not isinstance(interval, float | int | np.number) or not interval > 0:
+        if isinstance(interval, bool) or not isinstance(interval, float | int | np.number) or not 0 < interval < np.inf:
             raise ModelError(f"'{name}': interval must be a number > 0; got {interval!r}")
         if not isinstance(key, jax.Array):
             raise ModelError(f"'{name}': key is a key of random numbers, such as jax.random.key(0); got {key!r}")
