@@ -38,7 +38,7 @@ def _value(e, at, known):
         if e in at:
             known[e] = at[e]
         elif isinstance(e, sympy.Piecewise):
-            known[e] = next(_value(v, at, known) for v, c in e.args if _value(c, at, known))
+            known[e] = next(_value(p.args[0], at, known) for p in e.args if _value(p.args[1], at, known))
         elif e.is_Atom:
             known[e] = bool(e) if e in (sympy.true, sympy.false) else float(e)
         elif isinstance(e, sympy.Lt):
