@@ -213,9 +213,9 @@ def _gap_at_event(solution: Solution, at: Stopped) -> str:
     if not lines:
         return ""
     return (
-        f"the integration stopped at t={t:g}: '{solution.events.names[-1]}' began a mode whose constraint does not hold "
-        f"there: {some(lines)}. No impulse closes a gap. Let the mode begin where the constraint holds, with that as the "
-        "event's condition, or write the states with reinit(...)"
+        f"the integration stopped at t={t:g}: '{solution.events.names[-1]}' began a mode whose constraint does not "
+        f"hold there: {some(lines)}. No impulse closes a gap. Let the mode begin where the constraint holds, with that "
+        "as the event's condition, or write the states with reinit(...)"
     )
 
 
