@@ -149,5 +149,7 @@ def test_a_gap_that_no_impulse_closes_is_named_where_it_is():
         self.either(Eq(on, 1), x, f, order=2)
         self.when(ev.t >= 0.5, assign(on, 1))
 
-    with pytest.raises(SimulationError, match=r"t=0\.5: .* hold there: 'c: x', where it is 0\.875"):
+    with pytest.raises(
+        SimulationError, match=r"t=0\.5: .* hold there: 'c: x = 0 while Eq\(on, 1\)', where it is 0\.875"
+    ):
         simulate(compiled(component(write)), 1.0)
