@@ -18,6 +18,7 @@ TARGETS = {
     "x86_64-windows": ("x86_64-windows-gnu", ".dll"),
     "x86_64-darwin": ("x86_64-macos", ".dylib"),
     "aarch64-darwin": ("aarch64-macos", ".dylib"),
+    "wasm32-wasi": ("wasm32-wasi", ".wasm"),
 }
 # Folders of binaries in FMI 2.0, which knows fewer platforms.
 FOLDERS_OF_FMI_2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
@@ -72,8 +73,11 @@ def shared_library(
         for name, text in files.items():
             Path(folder, name).write_text(text)
         more = ["-lm"] if ending != ".dll" else []
-        if ending == ".so":  # an identity made of paths would differ from run to run
-            more.append("-Wl,--build-id=none")
+        if ending == ".so":  # no identity made of paths, which would differ from run to run, and no names of functions
+            more += ["-Wl,--build-id=none", "-s"]
+        if ending == ".wasm":  # a library whose functions the host calls, and that is loaded where it is put
+            flags = [f for f in flags if f not in ("-fPIC", "-shared")]
+            more += ["-mexec-model=reactor", "-rdynamic", "-s"]
         # Names without a folder: paths would get into the library.
         arguments = [*command, *flags, source, "-o", f"model{ending}", *more]
         done = subprocess.run(arguments, cwd=folder, capture_output=True, text=True)

@@ -16,6 +16,7 @@ blocks, discrete values, parameters, inputs, and the arrays of networks. `Progra
   states are off their constraints.
 """
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -67,7 +68,9 @@ class Programs:
     def __init__(
         self, system: AcausalSystem, outputs: Sequence[str], starts: Sequence[str], names: Sequence[str] = NAMES
     ):  # fmt: skip
-        self.system, self.plan, self.names = system, system.plan, tuple(names)
+        # Functions of the system that several programs need are functions of their own, written once for all of them:
+        # but for derivatives, where the field and what is read share more if both stand in one function.
+        self.system, self.plan, self.names = system.traced_once(), system.plan, tuple(names)
         self.nx, self.nz = len(self.plan.states), len(self.plan.carried)
         self.starts = tuple(starts)
         self._quantity = self.plan.resolve(outputs) if outputs else (np.zeros(0, np.int64), np.zeros(0))
@@ -153,7 +156,9 @@ class Programs:
 
     def _moving(self, z: Array, q: Array) -> Callable[..., Array]:
         """`unknowns` of what they are differentiated by."""
-        return lambda t, x, p, u, *weights: self.unknowns(t, x, z, q, p, u, *weights)
+        inside = copy.copy(self)
+        inside.system = dataclasses.replace(self.system, once=None)
+        return lambda t, x, p, u, *weights: inside.unknowns(t, x, z, q, p, u, *weights)
 
     def forward(self, z: Array, q: Array, at: Sequence[Array], along: Sequence[Array]) -> Array:
         """The derivative of `unknowns` along a direction."""

@@ -12,8 +12,7 @@ import numpy as np
 
 from ..base.errors import ModelError
 from .dependencies import MOVES, REDUCES, moved
-from .emit_c import where_written
-from .straight import CALLS, Constant, Operation, function_of, known, straight
+from .straight import CALLS, Constant, Operation, function_of, known, straight, where_written
 
 # Primitives that CasADi has under another name, or as an operator; those not listed here or below have the same name.
 _NAMES = {

@@ -5,15 +5,19 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+import numpy as np
+
 from .straight import Kind
 
 
 @dataclasses.dataclass(frozen=True)
 class Value:
-    """A value in C: an expression for a scalar, the name of a pointer for an array."""
+    """A value in C: an expression for a scalar, the name of a pointer for an array; and its entries, if they are
+    known."""
 
     text: str
     kind: Kind
+    known: np.ndarray | None = dataclasses.field(default=None, compare=False)
 
     def at(self, index: str) -> str:
         """The entry with this number."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import numpy as np
 import sympy
 
 from ..base.aliases import Condition, Expression
@@ -203,7 +204,7 @@ class ModeDeclarations(DiscreteDeclarations):
         act: 1 takes away the lowest derivative that may jump, 1 + e gives back the part e of it. `pushes` is the mode
         of a branch whose force is never negative."""
         where = f"component '{self.name}': either"
-        if isinstance(order, bool) or order not in range(HIGHEST + 1):
+        if isinstance(order, bool) or not isinstance(order, int | np.integer) or order not in range(HIGHEST + 1):
             raise ModelError(f"{where}: order says how many times a branch is differentiated, 0, 1 or 2; got {order!r}")
         then, otherwise = (_expression(zero_of(b), f"{where}: the branch") for b in (then, otherwise))
         if not order:

@@ -154,11 +154,10 @@ class Side:
         if not ts.shape[-1]:
             return ts
         first = self._first()
-        if rows.ndim > 2:
-            return eqx.filter_vmap(_observed, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0), 0, None, None))(
-                system, ts, rows, inputs, first, quantity, factor
-            )
-        return _observed(system, ts, rows, inputs, first, quantity, factor)
+        observed = _observed
+        for _ in range(rows.ndim - 2):  # the axes of a batch
+            observed = eqx.filter_vmap(observed, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0), 0, None, None))
+        return observed(system, ts, rows, inputs, first, quantity, factor)
 
 
 def _observed(

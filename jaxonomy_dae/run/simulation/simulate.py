@@ -172,6 +172,10 @@ def simulate(
     check_method(system, solver, adjoint, stepsize_controller)
     check_steps(system, ts, dtmax, max_steps)
     check_start(system, t0, t1, ts, initial)
+    # NumPy's truths and integers are no Python ones: `np.False_ is False` does not hold.
+    save_events, throw = (value if value is None else bool(value) for value in (save_events, throw))
+    max_steps, progress = int(max_steps), bool(progress)
+    max_events = None if max_events is None else int(max_events)
     t0 = initial_time(t0, initial)
     dtype = system.parameters.values.dtype
     read = read_inputs(system.plan, dtype, inputs)

@@ -155,6 +155,7 @@ class SystemAt:
         rest = along(jnp.zeros(m, self.dtype))
         return -solve_whole(plan.carried_pattern, matrix, rest, solver=plan.linear_solver)
 
+    @traced_once
     def carried_vector(self, t: Array, x: Array) -> Array:
         """The residuals of nonlinear blocks at the tearing variables in the state, shape (carried,)."""
         return self._joined(self.run(self.plan.carried_residuals, x, Refinement.NONE, t=t).residuals)
@@ -234,6 +235,7 @@ class SystemAt:
         found = (evaluation.equation(planned) for planned in self.plan.constraints)
         return [at.filled(at.residual()) for at in found]
 
+    @traced_once
     def constraint_vector(self, x: Array) -> Array:
         """All hidden constraints' residuals, shape (n_constraints,)."""
         return self._joined(self._constraints(x))
@@ -253,11 +255,13 @@ class SystemAt:
             self._chunk(x), self._chunk(sizes), inputs, self.parameters, self.t, networks, self.typical
         ).run(program, Refinement.NONE)
 
+    @traced_once
     def constraint_magnitudes(self, x: Array, sizes: Array) -> Array:
         """The magnitudes of the hidden constraints' terms, shape (n_constraints,)."""
         evaluation = self._measured(self.plan.constraint_program, x, sizes)
         return self._joined([evaluation.terms_of(evaluation.equation(planned)) for planned in self.plan.constraints])
 
+    @traced_once
     def carried_magnitudes(self, x: Array, sizes: Array) -> Array:
         """The magnitudes of the terms of nonlinear blocks, shape (carried,)."""
         return self._joined(self._measured(self.plan.carried_residuals, x, sizes).carried_magnitudes)
@@ -323,6 +327,7 @@ class SystemAt:
             x = self.refined(x, Refinement.ONCE if iterations == 1 else Refinement.ROOT)
         return x
 
+    @traced_once
     def _least_norm_step(self, x: Array) -> Array:
         plan = self.plan
         n = len(plan.states)
