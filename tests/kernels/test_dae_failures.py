@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from jaxonomy_dae import InitializationError, ModelError, SimulationError
+from jaxonomy_dae.solve.linear.sparse import SparsePattern
 from jaxonomy_dae.solve.methods.dae_term import FlatProblem
 from jaxonomy_dae.solve.methods.failures import explain_start, how_it_stopped, start_check
 from jaxonomy_dae.solve.methods.solve import _on_constraints
@@ -232,6 +233,15 @@ BAD = {
     "mass not finite": (
         lambda: DAETerm(minus, mass=np.array([1.0, np.nan])),
         SHAPE + "(2,) with entries that are not finite",
+    ),
+    "complex mass": (lambda: DAETerm(minus, mass=np.array([1j])), "mass must be real; it is complex"),
+    "mass of rows of two lengths": (
+        lambda: DAETerm(minus, mass=[[1.0], [2.0, 3.0]]),
+        "mass must be a matrix of numbers (n, n), or its diagonal (n,); got [[1.0], [2.0, 3.0]]",
+    ),
+    "places that are no integers": (
+        lambda: SparsePattern(np.array([0.5]), np.array([0]), 1),
+        "rows must be integers; got float64",
     ),
     "mass of another size": (
         lambda: solve_dae(DAETerm(minus, mass=np.ones(3)), 1.0, np.ones(2)),
