@@ -23,7 +23,7 @@ from .experiment import Experiment
 from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .identifiability import Identifiability, identifiability, natural_scale, spreads
-from .intervals import intervals, noise_intervals, profile
+from .intervals import checked_level, intervals, noise_intervals, profile
 from .law_process import LawProcess
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
@@ -261,7 +261,7 @@ class Estimate:
     def quantile(self, level: float) -> float:
         """Half of the width of an interval in standard deviations: a quantile of the normal distribution, or if the
         noise was estimated, of Student's distribution."""
-        upper = 0.5 * (1 + level)
+        upper = 0.5 * (1 + checked_level(level))
         if self.objective.evidence.labels:
             return float(scipy.stats.t.ppf(upper, max(self.freedom, 1.0)))
         return float(scipy.stats.norm.ppf(upper))
@@ -272,9 +272,9 @@ class Estimate:
         parameters are positive. Notes mark values that reached a bound, are not determined, or were frozen. The
         interval of a value that reached a bound is the part inside the bound. Estimated noise levels have χ² intervals.
         With `white=False` the intervals hold if residuals are correlated in time."""
+        factor = self.quantile(level)
         noise = noise_intervals(self.objective, self.minimum, self.taken, level)
         spread = self.spread if white else self.correlated_spread
-        factor = self.quantile(level)
         return intervals(self.objective, self.point, spread, self._unknown, factor, level, noise, self.at_bounds)
 
     @functools.cached_property
