@@ -122,8 +122,8 @@ FAULTS = [
     ),
     Fault(
         "write/mode_declarations.py",
-        "moves(part >= 1, 0, 1, EventFlag.LISTED)",
-        "moves(part >= 1, 0, -1, EventFlag.LISTED)",
+        "part = below / jump",
+        "part = above / jump",
         "tests/plants/test_sliding.py",
     ),
     Fault(
