@@ -414,6 +414,20 @@ def test_sanitizers_find_nothing(tmp_path, kind, least):
 
 
 @pytest.mark.slow
+def test_importers_are_told_to_begin_anew_where_a_mode_changes(tmp_path):
+    """A thermostat switches: its temperature goes on, with another slope."""
+    with opened(exported(hybrid(Thermostat, "c"), tmp_path)) as fmu:
+        before, on = fmu.get("c.T", "der(c.T)"), fmu.get("c.on")
+        fmu.model.enterContinuousTimeMode()
+        for T in (10.0, 30.0):
+            fmu.model.setContinuousStates(np.array([T]).ctypes.data_as(model_pointer()), 1)
+            fmu.model.completedIntegratorStep()
+        fmu.model.enterEventMode()
+        found = fmu.model.updateDiscreteStates()
+        assert found[3] and fmu.get("c.T")[0] == 30.0 and before[0] != 30.0 and fmu.get("c.on") in (on, 1 - on)
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("valgrind") is None, reason="Valgrind is not installed")
 def test_valgrind_finds_nothing_in_many_events(ball, tmp_path):
     """A ball that bounces 10,000 times at one place: no byte that is read or left behind wrongly, and as much memory as
