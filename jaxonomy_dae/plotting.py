@@ -44,7 +44,8 @@ class Response(Protocol):
 
 
 def plot_solution(solution: ByName, *names: str, ax: Axes | None = None, events: bool = True) -> Any:
-    """Draws variables over time, discrete ones as steps: one panel for each unit, one below the other.
+    """Draws variables over time, discrete ones as steps: one panel for each unit, one below the other. Of a batch, each
+    member has a line.
 
     **Arguments:**
 
@@ -91,10 +92,14 @@ def _panel(solution: ByName, names: list[str], units: list[str], ax: Axes, event
             points = (time, values) if style == "default" else _steps(solution, name)
             ax.plot(*points, label=label, linewidth=1.6, drawstyle=style)
             continue
-        rest = values.reshape(len(time), -1)
-        line = ax.plot(time, rest[:, 0], label=label, linewidth=0.8, drawstyle=style)[0]
-        # One colour and one entry of the legend for an array: a thousand cells have no names worth reading.
-        ax.plot(time, rest[:, 1:], color=line.get_color(), linewidth=0.8, alpha=0.5, drawstyle=style)
+        # One colour and one entry of the legend for an array, and for a batch, whose members have times of their own: a
+        # thousand cells have no names worth reading.
+        times = time.reshape(-1, time.shape[-1])
+        curves = values.reshape(*times.shape, -1)
+        line = ax.plot(times[0], curves[0, :, 0], label=label, linewidth=0.8, drawstyle=style)[0]
+        for k, (own, rest) in enumerate(zip(times, curves, strict=True)):
+            rest = rest[:, 1:] if k == 0 else rest
+            ax.plot(own, rest, color=line.get_color(), linewidth=0.8, alpha=0.5, drawstyle=style)
     marked = _mark_events(solution, ax) if events else False
     ax.set_xlabel("Time / s")
     if len(names) == 1:

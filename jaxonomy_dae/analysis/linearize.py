@@ -10,18 +10,19 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ..base.aliases import Time
-from ..base.errors import ModelError, explained_keywords, nearest
+from ..base.errors import ModelError, SteadyStateError, explained_keywords, nearest
 from ..compile.diagnosis.wording import some
 from ..host.staging import is_staged, is_traced
 from ..run.system.input_values import by_entry
 from ..run.system.inputs import read_inputs, value_at
 from ..run.system.system import AcausalSystem
 from .events_at_rest import resting_events
+from .many_equilibria import same_beside, wandered
 from .operating_point import OperatingPoint
 from .partials import Driven, Partials, compiled_partials, on_tangent, partials_at
 from .sampled import sampled_space
 from .state_space import StateSpace
-from .steady_state import Drifting, check_system, equilibrium_from, point_of
+from .steady_state import Drifting, check_system, equilibrium_from, one_of_many, point_of
 from .tangent import Coordinates, choose_coordinates
 
 
@@ -70,7 +71,8 @@ def linearize(
         model has no clock or no common period; and at a point where an event is about to change the model. Inside jit,
         not-a-number stands for errors that depend on values.
     - `SteadyStateError` if `at` is left out and there is no equilibrium; inside jit, grad and vmap the state space is
-        then not-a-number.
+        then not-a-number. Also if it is one of many with different linear models, as of bodies that exchange heat with
+        each other alone; this is not noticed inside jit, grad and vmap.
     """
     check_system(system)
     dtype = system.parameters.values.dtype
@@ -79,8 +81,10 @@ def linearize(
     given = by_entry(system.plan, read_inputs(system.plan, dtype, inputs)) if isinstance(inputs, Mapping) else {}
     quantity, factor = system.plan.resolve(outputs)
     _check_inputs(system, names, given, at)
+    found, way = None, None
     if at is None:
-        found, t, read = equilibrium_from(system, t, given, None, Drifting(), throw=None)
+        found, t, read, begin = equilibrium_from(system, t, given, None, Drifting(), throw=None)
+        way = None if is_traced((found, begin)) else wandered(found, np.asarray(begin))
         at = point_of(system, found, t, read, drifting=Drifting(), singular_is_error=False, throw=None)
     # Each member of a batch may have coordinates of its own, and so other states.
     if jnp.ndim(at.x) != 1:
@@ -89,8 +93,12 @@ def linearize(
     u = jnp.stack([_value_at(system, values, name, at.t) for name in names]) if names else at.x[:0]
     q = at.system.discrete_values.astype(at.x.dtype)
     point = Driven(at.t, at.x, q, values, u, tuple(names), tuple(outputs))
-    arguments = (system, point, tuple(quantity.tolist()), tuple(factor.tolist()))
-    partials = partials_at(*arguments) if is_staged(arguments) else compiled_partials(*arguments)
+    read_as = tuple(quantity.tolist()), tuple(factor.tolist())
+    evaluate = partials_at if is_staged((system, point)) else compiled_partials
+    partials = evaluate(system, point, *read_as)
+    if found is not None and way is not None:
+        if not same_beside(lambda x: evaluate(system, point._replace(x=x), *read_as), point.x, way):
+            raise SteadyStateError(one_of_many(system, found))
     partials = _smooth(system, _consistent(system, partials))
     coordinates = _coordinates(system, partials, states)
     if sampled:

@@ -85,7 +85,7 @@ def partials_at(system: AcausalSystem, point: Driven, quantity: tuple[int, ...],
     # The first side is the point itself, whose derivatives are taken; the others are compared with it.
     on_sides = jax.vmap(of)(sides.at[0].set(q))
     (of_slopes, of_constraints, of_outputs), (slopes, left, y) = jax.tree.map(lambda a: a[0], on_sides)
-    agree = jnp.stack([_alike(leaf) for leaf in jax.tree.leaves(on_sides)]).all()
+    agree = jnp.stack([alike(leaf) for leaf in jax.tree.leaves(on_sides)]).all()
     agree, off = agree & ~_moves(system.plan, near), _off(system, point, left)
     return Partials(slopes, y, of_slopes, of_constraints, of_outputs, off, agree, near)
 
@@ -99,7 +99,7 @@ def _off(system: AcausalSystem, point: Driven, left: Array) -> Array:
     return jnp.abs(left) > spacing(left.dtype) ** 0.5 * here.constraint_magnitudes(point.x, reach)
 
 
-def _alike(sides: Array) -> Array:
+def alike(sides: Array) -> Array:
     """Whether rows are the same, to half of the digits of the largest entry."""
     # Branches that meet with one slope differ by rounding alone. Kinks differ by parts of order one.
     allowed = spacing(sides.dtype) ** 0.5 * jnp.max(jnp.abs(sides), initial=0.0)

@@ -63,7 +63,9 @@ def steady_state(
     - `initial`: where the search starts, values by variables' names; default: the initial point. It decides which of
         several equilibria is found.
     - `drifting`: states whose derivatives need not vanish, such as the angle of a shaft at steady speed, and discrete
-        variables that need not settle, such as a counter. They keep their start values.
+        variables that need not settle, such as a counter. They keep their start values. Where a sum is conserved, such
+        as the fluid in connected tanks, equilibria are many: one state has to be named here, and its start value is the
+        one at rest.
     - `throw`: whether to raise an error if there is no such point. With False, its values and their derivatives are
         not-a-number. None: raise outside jit, grad and vmap only. Inside jit, True needs callbacks to the host, and
         JAX's persistent cache does not keep such programs.
@@ -84,7 +86,7 @@ def steady_state(
     """
     check_system(system)
     places = _places(system, drifting)
-    found, t, inputs = equilibrium_from(system, t, inputs, initial, places, throw)
+    found, t, inputs, _ = equilibrium_from(system, t, inputs, initial, places, throw)
     return point_of(system, found, t, inputs, drifting=places, singular_is_error=True, throw=throw)
 
 
@@ -95,8 +97,9 @@ def equilibrium_from(
     initial: Mapping[str, object] | None,
     drifting: Drifting,
     throw: bool | None,
-) -> tuple[Equilibrium, Array, dict[str, Array]]:
-    """The search from the initial point; the time and the inputs as arrays and as they were read."""
+) -> tuple[Equilibrium, Array, dict[str, Array], Array]:
+    """The search from the initial point; the time and the inputs as arrays and as they were read; the state array of
+    the initial point."""
     dtype = system.parameters.values.dtype
     initial = system.plan.one_by_one(initial)
     begin = find_initial(system, t, inputs, initial)
@@ -108,8 +111,8 @@ def equilibrium_from(
         found = compiled_search(*given, *drifting)
         # An input's function may close over a traced value, which shows in the outcome only.
         if not is_staged(found):
-            return found, t, inputs
-    return find_equilibrium(*given, *drifting), t, inputs
+            return found, t, inputs, begin.x
+    return find_equilibrium(*given, *drifting), t, inputs, begin.x
 
 
 def point_of(
@@ -217,6 +220,16 @@ def _singular(system: AcausalSystem, found: Equilibrium, drifting: Drifting) -> 
     return (
         f"the equilibrium is singular: nothing determines {_directions(loose)}. To keep the value at the start, say "
         f"drifting={_enough(system, found, drifting)}; or add what holds it, such as a spring or a load"
+    )
+
+
+def one_of_many(system: AcausalSystem, found: Equilibrium) -> str:
+    """Says that the linear model depends on which equilibrium is meant, where nothing determines some directions."""
+    drifting = Drifting()
+    loose, kept = _directions(_undetermined(system, found, drifting)), _enough(system, found, drifting)
+    return (
+        f"the equilibrium is one of many: nothing determines {loose}, and the linear model is another one at each. Say "
+        f"which is meant: at=steady_state(system, drifting={kept}) keeps the value at the start"
     )
 
 

@@ -1,7 +1,7 @@
 """What tracers tell: whether what is computed now becomes part of a program that somebody else compiles, and how it
 will be differentiated."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -75,6 +75,13 @@ def kind(layer: Any) -> str:
     name = type(layer).__name__
     is_reverse = getattr(getattr(layer, "_trace", None), "is_vjp", True)
     return LINEARIZED if name == "LinearizeTracer" and not is_reverse else name
+
+
+def trace_of(layer: Any) -> Hashable:
+    """What tells the transformation that a tracer belongs to from others of its kind around it. If JAX does not say it,
+    no two tracers belong to one."""
+    trace = getattr(layer, "_trace", layer)
+    return id(getattr(trace, "tag", trace))
 
 
 def layers(leaf: PyTree) -> Iterator[Any]:

@@ -22,7 +22,7 @@ from jax.custom_derivatives import SymbolicZero
 from ..base.aliases import PyTree
 from ..base.private_names import MissingName, clear_jitted, private
 from .program import Program
-from .staging import is_staged, is_traced, kind, layers
+from .staging import is_staged, is_traced, kind, layers, trace_of
 from .whole_records import WHOLE, numbered, whole_records
 
 Traceable: TypeAlias = Callable[[list[PyTree]], PyTree]
@@ -339,11 +339,15 @@ def _at_work(arrays: list[Array]) -> str:
         return ""
     if is_staged(arrays):
         return "other"
-    kinds = [tuple(map(kind, layers(a)))[:-1] for a in arrays]
-    deepest = max(kinds, key=len)
+    chains = [[*layers(a)][:-1] for a in arrays]
+    # Whose a tracer is tells its trace, not its class: in a grid by two `jax.vmap`, one array is a batch of the outer
+    # one, and another is a batch of the inner one, which are two axes.
+    traces = [tuple(map(trace_of, chain)) for chain in chains]
+    whole = max(traces, key=len)
     # All others must be wrapped by the same, or by what it wraps.
-    if any(kind != deepest[len(deepest) - len(kind) :] and kind[:1] != deepest[:1] for kind in kinds):
+    if any(trace != whole[len(whole) - len(trace) :] and trace[:1] != whole[:1] for trace in traces):
         return "other"
+    deepest = tuple(map(kind, max(chains, key=len)))
     if deepest[0] == "LinearizeTracer" or deepest == ("BatchTracer",):
         return deepest[0]
     # Numbers that are not differentiable have a derivative of a type of its own, which programs do not take.

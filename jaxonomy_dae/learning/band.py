@@ -83,14 +83,19 @@ class Band:
 def band(
     estimate: "Estimate", name: str, grid: Any, law: Callable | None, along: Any, factor: float
 ) -> Band:  # fmt: skip
-    """The band of a network's or sensor law's values, linearized around its weights."""
+    """The band of a network's or sensor law's values: linearized around its weights, and of raw networks as functions
+    (`law_process.py`)."""
     objective = estimate.objective
     module, law, points = law_of(estimate, name, grid, law)
     flat = jnp.concatenate([jnp.ravel(leaf).astype(points.dtype) for leaf in weights_of(module)])
     mean, slope = (np.asarray(a, float) for a in _law_and_slope(module, law, flat, points))
     c = objective.coordinates
     columns = np.array([g == name for g in c.group]) & c.is_weight
-    spread = np.linalg.norm(slope @ c.moved(estimate.point, estimate.root)[columns], axis=1)
+    variance = np.sum((slope @ c.moved(estimate.point, estimate.root)[columns]) ** 2, axis=1)
+    process = estimate.law_process(name)
+    if process is not None:
+        variance += process.share * (process.variance(module, law, points, np.asarray(grid, float)) - variance)
+    spread = np.sqrt(variance)
     ends = explored(estimate, name, along)
     return Band(np.asarray(grid, float), mean, spread, mean - factor * spread, mean + factor * spread, ends)
 

@@ -14,6 +14,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..base.errors import ModelError
 from .data import Stacked
 
 EVEN = 1e-3  # of a step, by which gaps may differ from whole numbers of them
@@ -62,6 +63,24 @@ class Colour:
     def log_scale(self, share: Float[np.ndarray, " m"]) -> float:
         """½ Σ w ln (1 − φ²), by which −ln L is more than that of independent innovations."""
         return 0.5 * float(np.sum(share**2 * np.log1p(-(self.phi**2))))
+
+
+def check_steps(s: Stacked) -> None:
+    """Refuses noise of a known correlation below zero whose samples are not whole steps apart: between them, such noise
+    has no meaning.
+
+    **Raises:**
+
+    - `ModelError` that names the record and the output.
+    """
+    for j in np.flatnonzero(s.rho < 0):
+        for k, label in enumerate(s.labels):
+            gaps = steps_between(s.times[k, : s.counts[k]])(np.flatnonzero(s.observed[k, : s.counts[k], j]))
+            if not np.array_equal(gaps, np.rint(gaps)):
+                raise ModelError(
+                    f"{label}: the samples of '{s.outputs[j]}' are not whole sampling steps apart, over which alone "
+                    f"rho = {s.rho[j]:g} of its noise, below zero, has a meaning: resample(times), or leave rho out"
+                )
 
 
 def steps_between(times: Float[np.ndarray, " n"]):

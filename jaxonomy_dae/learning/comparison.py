@@ -61,7 +61,7 @@ def cross_validate(
     labels = [k for k, one in zip(problem.data.labels, problem.data.experiments, strict=True) if not one.holdout]
     if len(labels) < 2:
         raise ModelError("cross_validate needs two experiments or more: cut a record into windows, Experiment.window")
-    if folds is None or isinstance(folds, int):
+    if folds is None or isinstance(folds, int | np.integer):
         count = len(labels) if folds is None else whole_number(folds, "folds", least=2)
         if count > len(labels):
             raise ModelError(f"folds: there are {len(labels)} experiments, too few for {count} folds")
@@ -147,7 +147,7 @@ def compare(fits: Mapping[str, Estimate]) -> Comparison:
         if _data_of(fit) != _data_of(fits[first]):
             raise ModelError(f"compare: '{name}' was fitted to other data than '{first}': fit all to the same")
         samples = fit.minimum.weights.samples
-        effective = samples - fit.freedom + len(fit.sigma)
+        effective = samples - fit.freedom + len(fit.sigma) + len(fit.rho)
         held = fit.objective.held_out(fit.minimum.z, fit.minimum.weights)[1]
         bic = float(effective * np.log(samples) - 2 * fit.log_likelihood)
         found[name] = Compared(fit.chi2, fit.freedom, effective, bic, 0.0, -held)

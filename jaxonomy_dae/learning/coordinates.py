@@ -25,7 +25,7 @@ from ..run.system.parameters import ParameterNames
 from ..write.interval import Interval, closed_ends
 from .data import Stacked
 from .experiment import Unknown
-from .priors import LogNormal, Normal, Prior
+from .priors import LogNormal, Normal, Prior, is_finite, unwrapped
 from .program import Setting
 
 
@@ -155,7 +155,8 @@ class Coordinates:
         for name, value in values.items():
             chosen = self._known(name)
             if value is not None:
-                if np.ndim(value) or isinstance(value, str) or not np.isfinite(value):
+                value = unwrapped(value)
+                if not is_finite(value):
                     raise ModelError(f"'{name}' needs a finite number; got {value!r}")
                 if name not in self.names:
                     raise ModelError(
@@ -180,6 +181,11 @@ class Coordinates:
                 new_low, new_high = (float(end) for end in given)
             except (TypeError, ValueError):
                 raise ModelError(f"bounds of '{name}' are a pair (low, high); got {given!r}") from None
+            # What was declared without its end stands here as the number beside it: its end says the same.
+            if new_low == np.nextafter(low[chosen].min(), -np.inf):
+                new_low = low[chosen].min()
+            if new_high == np.nextafter(high[chosen].max(), np.inf):
+                new_high = high[chosen].max()
             if not new_low <= new_high or new_low < low[chosen].min() or new_high > high[chosen].max():
                 raise ModelError(
                     f"bounds of '{name}' must lie within those declared, "
@@ -285,19 +291,19 @@ def _named_weights(name: str, module: PyTree) -> list[tuple[str, float]]:
 def _start(label: str, units: dict[str, str], name: str, given: float | Unknown, table: ParameterNames) -> Coordinate:
     low, high = -math.inf, math.inf
     log = False
+    spread = float(given.spread) if isinstance(given, Unknown) and given.spread is not None else math.inf
     if name in table.names:
         interval = table.intervals[table.index(name)]
         low, high = closed_ends([interval])[0]
-        log = is_positive(interval)
+        log = is_positive(interval) and math.isinf(spread)  # a prior is normal on the scale of the search
     known = not isinstance(given, Unknown)
     guess = float(given.guess if isinstance(given, Unknown) else given)
     if not low <= guess <= high:
         raise ModelError(
             f"{label}: the guess must lie in [{end_text(low)}, {end_text(high)}], as '{name}' does; got {guess:g}"
         )
-    spread = float(given.spread) if isinstance(given, Unknown) and given.spread is not None else math.inf
     size = 1.0 if log else spread if math.isfinite(spread) else abs(guess) or 1.0
-    spread /= guess if log else size
+    spread /= size
     centre = math.log(guess) if log else guess / size
     return Coordinate(
         label, units.get(name, ""), name, False, log, size, guess, low=low, high=high, spread=spread, fixed=known,

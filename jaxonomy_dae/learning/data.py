@@ -2,8 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,6 +15,9 @@ from ..run.system.inputs import KINDS
 from .axes import LEGEND, AxesGiven, chosen_names, grid_of_axes
 from .experiment import Experiment, Unknown, check_increasing
 from .noise import Noise
+from .priors import is_finite, unwrapped
+
+Entry = TypeVar("Entry")
 
 
 class Data:
@@ -153,9 +156,12 @@ class Stacked:
         return dataclasses.replace(self, times=times, observed=self.observed & inside[:, :, None])
 
 
-def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mapping[str, object]) -> Stacked:
+def stack(
+    data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mapping[str, object], like: Stacked | None = None
+) -> Stacked:
     """The data of a system whose `derived` outputs are computed from its variables; `starts` are for experiments that
-    do not name them."""
+    do not name them. Names come in the order in which other data, `like`, have them, and constants of inputs are of the
+    kind that they have there."""
     experiments = data.experiments
     outputs: dict[str, None] = {}
     columns: list[dict[str, np.ndarray]] = []
@@ -172,6 +178,7 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mappin
                 raise ModelError(
                     f"{label}: the noise of '{name}' has another distribution, correlation or shared level than before"
                 )
+    outputs = _ordered(outputs, () if like is None else like.outputs)
     n = max(len(one.times) for one in experiments)
     shape = (len(experiments), n, len(outputs))
     values, levels, unit = np.full(shape, math.nan), np.full(shape, math.nan), np.ones(shape)
@@ -188,7 +195,7 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mappin
     if not observed[training].any():
         raise ModelError("all samples are missing: the data are NaN throughout")
     times = np.stack([_padded(one.times, n) for one in experiments])
-    inputs, kinds = _inputs(data, plan)
+    inputs, kinds = _inputs(data, plan, {} if like is None else dict(like.kinds))
     return Stacked(
         outputs=tuple(outputs),
         times=times,
@@ -205,10 +212,15 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: Mappin
         holdout=~training,
         inputs=inputs,
         kinds=kinds,
-        starts=_starts(data, starts),
+        starts=_ordered(_starts(data, starts), () if like is None else like.starts),
         labels=tuple(data.labels),
         counts=tuple(len(one.times) for one in experiments),
     )
+
+
+def _ordered(found: Mapping[str, Entry], first: Iterable[str]) -> dict[str, Entry]:
+    """The same entries, those of the `first` names before all others."""
+    return {name: found[name] for name in dict.fromkeys([*first, *found]) if name in found}
 
 
 def _padded(array: np.ndarray, n: int) -> np.ndarray:
@@ -250,10 +262,11 @@ def _columns(
 
 
 def _inputs(
-    data: Data, plan: SystemPlan
+    data: Data, plan: SystemPlan, like: Mapping[str, str]
 ) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], tuple[tuple[str, str], ...]]:
-    """Samples of every input, padded beyond their ends to the same number, and how each is interpolated."""
-    names = dict.fromkeys(name for one in data.experiments for name in one.inputs)
+    """Samples of every input, padded beyond their ends to the same number, and how each is interpolated; `like` are the
+    kinds of other data."""
+    names = _ordered(dict.fromkeys(name for one in data.experiments for name in one.inputs), like)
     found, kinds = {}, []
     for name in names:
         if name not in plan.inputs.place:
@@ -276,7 +289,7 @@ def _inputs(
             given.append((times, values))
         m = max(len(times) for times, _ in given)
         padded = [_beyond(times, m) for times, _ in given]
-        kind = kind or "held"
+        kind = kind or like.get(name, "held")
         found[name] = (
             np.stack(padded),
             np.stack([_continued(*one, at, kind) for one, at in zip(given, padded, strict=True)]),
@@ -288,7 +301,10 @@ def _inputs(
 def _samples(name: str, source: object, one: Experiment, label: str) -> tuple[np.ndarray, np.ndarray, str | None]:
     """(times, values, kind) of an input; a constant is of any kind."""
     end = float(one.times[-1])
+    source = unwrapped(source)
     if isinstance(source, int | float | np.number):
+        if not np.isfinite(source):
+            raise ModelError(f"{label}: input '{name}' must be finite; got {source}")
         # Two times that differ, even for a record of a single sample at its start.
         return np.array([one.t0, max(end, one.t0 + 1.0)]), np.full(2, float(source)), None
     if not isinstance(source, tuple | list) or len(source) not in (2, 3):
@@ -346,7 +362,8 @@ def _starts(data: Data, given: Mapping[str, Any]) -> dict[str, tuple[float | Unk
             if value is None:
                 raise ModelError(f"{label} does not say how '{name}' starts, as others do: add it to its initial=")
             if not isinstance(value, Unknown):
-                if np.ndim(value) or isinstance(value, str) or not np.isfinite(value):
+                value = unwrapped(value)
+                if not is_finite(value):
                     raise ModelError(f"{label}: '{name}' starts at a finite number or Unknown(guess); got {value!r}")
                 value = float(value)
             values.append(value)

@@ -5,7 +5,7 @@ terms where the experiments say little. Here each candidate stands in the equati
 themselves, with everything else that is estimated. Candidates are compared by Schwarz's criterion (1978, Annals of
 Statistics 6:461)
 
-    BIC = Σ (r/σ)² + Σ ln σ² + k ln n
+    BIC = −2 ln L + k ln n,    of white noise Σ (r/σ)² + Σ ln σ² + k ln n,
 
 with k numbers (coefficients, and those inside terms) and n samples: half of it approximates the negative logarithm of
 the evidence. Forms within 2 of each other are not told apart by the data (Kass & Raftery 1995, J. Am. Stat. Assoc.
@@ -243,7 +243,8 @@ def _numbers_of(terms: tuple[AbstractTerm, ...], subset: tuple[int, ...]) -> tup
 def criterion(fitted: "Estimate", count: int) -> float:
     """Schwarz's criterion; what all candidates have in common, such as other parameters, is left out."""
     weights = fitted.minimum.weights
-    return 2 * fitted.minimum.cost - 2 * weights.log_rows + count * float(np.log(weights.samples))
+    scale = fitted.objective.colour.log_scale(weights.share)  # of the density of correlated noise
+    return 2 * (fitted.minimum.cost - weights.log_rows + scale) + count * float(np.log(weights.samples))
 
 
 def _lack_of_fit(network: "Estimate", closed: "Estimate", name: str) -> float:

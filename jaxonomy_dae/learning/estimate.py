@@ -23,7 +23,8 @@ from .experiment import Experiment
 from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .identifiability import Identifiability, identifiability, natural_scale, spreads
-from .intervals import intervals, noise_intervals, profile
+from .intervals import checked_level, intervals, noise_intervals, profile
+from .law_process import LawProcess
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
 from .program import with_values
@@ -260,7 +261,7 @@ class Estimate:
     def quantile(self, level: float) -> float:
         """Half of the width of an interval in standard deviations: a quantile of the normal distribution, or if the
         noise was estimated, of Student's distribution."""
-        upper = 0.5 * (1 + level)
+        upper = 0.5 * (1 + checked_level(level))
         if self.objective.evidence.labels:
             return float(scipy.stats.t.ppf(upper, max(self.freedom, 1.0)))
         return float(scipy.stats.norm.ppf(upper))
@@ -271,9 +272,9 @@ class Estimate:
         parameters are positive. Notes mark values that reached a bound, are not determined, or were frozen. The
         interval of a value that reached a bound is the part inside the bound. Estimated noise levels have χ² intervals.
         With `white=False` the intervals hold if residuals are correlated in time."""
+        factor = self.quantile(level)
         noise = noise_intervals(self.objective, self.minimum, self.taken, level)
         spread = self.spread if white else self.correlated_spread
-        factor = self.quantile(level)
         return intervals(self.objective, self.point, spread, self._unknown, factor, level, noise, self.at_bounds)
 
     @functools.cached_property
@@ -328,6 +329,10 @@ class Estimate:
     ) -> Band:
         """A learned law over a grid, with its spread and the explored region.
 
+        Of a raw `equinox.nn.MLP` whose prior the evidence chooses, two models of the law are weighted by their
+        evidence: the network's weights, linearized, and a Gaussian process, which allows for kinks that no weight sets.
+        The first call for a law compiles a program. Of other networks, the spread is that of the weights.
+
         **Arguments:**
 
         - `name`: the name of a trained network or sensor law.
@@ -374,6 +379,17 @@ class Estimate:
             return self.objective, self.point, self.root, experiment
         new = Unseen.of(self, experiment, first)
         return new.objective, new.point, new.root, 0
+
+    def law_process(self, name: str) -> LawProcess | None:
+        """A learned law as a Gaussian process, with the probability that it is the better model of it; None of networks
+        that promise more than to be functions."""
+        if name not in self._processes:
+            self._processes[name] = LawProcess.of(self, name)
+        return self._processes[name]
+
+    @functools.cached_property
+    def _processes(self) -> dict[str, LawProcess | None]:
+        return {}
 
     def explored(self, name: str, along: str | Callable[[Any], Any] | None = None) -> Float[np.ndarray, "inputs 2"]:
         """The range of values that the experiments contain, of each input of a learned law, or of the quantity

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from ..base.errors import ModelError, by_name, explained, explained_keywords, nearest, whole_number
 from ..compile.lowering.plan import SystemPlan
 from .noise import ESTIMATE, Noise
-from .priors import is_finite
+from .priors import is_finite, unwrapped
 from .records import interpolated, low_pass, smoothed, untrended
 
 Numbers: TypeAlias = ArrayLike | Sequence[float]
@@ -38,6 +38,8 @@ class Unknown:
     shared: bool = False
 
     def __post_init__(self):
+        for name in ("guess", "spread"):
+            object.__setattr__(self, name, unwrapped(getattr(self, name)))
         if not is_finite(self.guess):
             raise ModelError(f"Unknown needs a finite guess; got {self.guess!r}")
         if self.spread is not None and not (is_finite(self.spread) and self.spread > 0):
@@ -82,11 +84,14 @@ class Experiment:
     name: str = ""
 
     def __post_init__(self):
+        for name in ("t0", "weight"):
+            object.__setattr__(self, name, unwrapped(getattr(self, name)))
         object.__setattr__(self, "times", _times(self.times, self.t0))
         if not isinstance(self.data, Mapping) or not self.data:
             raise ModelError(f"data is a dictionary by variables' names, {{'m.x': values}}; got {self.data!r}")
-        by_name("initial", self.initial, "'motor.w': Unknown(0.0)")
-        by_name("inputs", self.inputs, "'motor.u': (times, values)")
+        for name, example in (("initial", "'motor.w': Unknown(0.0)"), ("inputs", "'motor.u': (times, values)")):
+            given = by_name(name, getattr(self, name), example)
+            object.__setattr__(self, name, {key: unwrapped(value) for key, value in given.items()})
         count = len(self.times)
         object.__setattr__(self, "data", {name: _samples(name, v, count) for name, v in self.data.items()})
         object.__setattr__(self, "sigma", self._sigmas())
@@ -104,12 +109,12 @@ class Experiment:
         by_name = given if isinstance(given, Mapping) else dict.fromkeys(self.data, given)
         out: dict[str, float | np.ndarray | Noise] = {}
         for name, samples in self.data.items():
-            value: Any = by_name.get(name, ESTIMATE)
+            value: Any = unwrapped(by_name.get(name, ESTIMATE))
             if isinstance(value, str) and value == ESTIMATE:
                 out[name] = math.nan
             elif not isinstance(value, str) and is_finite(value) and value > 0:
                 out[name] = float(value)
-            elif isinstance(value, np.ndarray | list | tuple):
+            elif not isinstance(value, str) and (isinstance(value, list | tuple) or hasattr(value, "shape")):
                 out[name] = _levels_of(name, value, samples)
             elif isinstance(value, Noise):
                 scale = None if value.scale is None else _levels_of(name, value.scale, samples)
@@ -122,7 +127,7 @@ class Experiment:
     def from_frame(
         cls,
         frame: Any,
-        data: Sequence[str] | Mapping[str, str],
+        data: str | Sequence[str] | Mapping[str, str],
         *,
         time: str | None = None,
         inputs: Mapping[str, Samples | str | tuple[str, str]] | None = None,
@@ -132,33 +137,39 @@ class Experiment:
 
         **Arguments:**
 
-        - `data`: columns by variables' names, `{"room.T": "Ti"}`, or a list if the columns have these names.
+        - `data`: columns by variables' names, `{"room.T": "Ti"}`, or a name or a list if the columns have these names.
         - `time`: the column of times, in seconds or as dates; None: the index. Dates count in seconds from the first.
         - `inputs`: columns by inputs' names, `{"heater.Q": ("Ph", "held")}`; other inputs as in `Experiment`.
         - `others`: as in `Experiment`.
         """
-        columns = data if isinstance(data, Mapping) else {name: name for name in data}
+        names = [data] if isinstance(data, str) else data
+        columns = names if isinstance(names, Mapping) else {name: name for name in names}
         times = _seconds(frame.index if time is None else _column(frame, time))
         given = {}
         for name, source in (inputs or {}).items():
             parts = (source,) if isinstance(source, str) else source
             if isinstance(parts, tuple | list) and isinstance(parts[0], str):
-                given[name] = (times, np.asarray(_column(frame, parts[0]), float), *parts[1:])
+                given[name] = (times, _numbers(frame, parts[0]), *parts[1:])
             else:
                 given[name] = source
-        values = {name: np.asarray(_column(frame, column), float) for name, column in columns.items()}
+        values = {name: _numbers(frame, column) for name, column in columns.items()}
         return cls(times, values, inputs=given, **others)
 
     @classmethod
     def from_csv(
-        cls, path: str | Path, data: Sequence[str] | Mapping[str, str], *, time: str, **others: Any
+        cls, path: str | Path, data: str | Sequence[str] | Mapping[str, str], *, time: str, **others: Any
     ) -> "Experiment":
         """A record from a text file with commas, whose first line names the columns; empty cells are missing samples.
         Dates are understood. `data`, `inputs` and `others` as in `from_frame`."""
-        with open(path, newline="", encoding="utf-8") as file:
+        with open(path, newline="", encoding="utf-8-sig") as file:  # some programs begin a file with a mark
             rows = list(csv.DictReader(file))
         if not rows:
             raise ModelError(f"{path}: there are no rows below the first line")
+        longer = [k for k, row in enumerate(rows) if None in row]
+        if longer:
+            raise ModelError(
+                f"{path}: row {longer[0] + 1} below the first line has more cells than the first line names"
+            )
         table = {key: _cells([row[key] for row in rows]) for key in rows[0]}
         return cls.from_frame(table, data, time=time, **others)
 
@@ -167,11 +178,11 @@ class Experiment:
     @explained_keywords()
     def window(self, start: float, end: float, initial: Mapping[str, float | Unknown] | None = None) -> "Experiment":
         """The samples from `start` to `end`, as an experiment that begins at `start`. `initial` replaces the values
-        known at `t0`.
+        known at `t0`, and those of which something is known there: unknown ones with a spread.
 
         **Raises:**
 
-        - `ModelError` if there are no samples, or if values are known at `t0` but not at `start`.
+        - `ModelError` if there are no samples, or if something is known of a value at `t0` but not at `start`.
         """
         if not (is_finite(start) and is_finite(end) and self.t0 <= start < end):
             raise ModelError(f"window: start and end are times, {self.t0:g} ≤ start < end; got {start!r} and {end!r}")
@@ -179,7 +190,11 @@ class Experiment:
         if not rows.any():
             raise ModelError(f"window: there is no sample from {start:g} to {end:g}")
         new = dict(initial or {})
-        old = [name for name, value in self.initial.items() if is_finite(value) and name not in new]
+        old = [
+            name
+            for name, value in self.initial.items()
+            if name not in new and (not isinstance(value, Unknown) or value.spread is not None)
+        ]
         if start > self.t0 and old:
             raise ModelError(
                 f"window: '{old[0]}' is known at {self.t0:g}, not at {start:g}: say what it is there, "
@@ -193,7 +208,13 @@ class Experiment:
     def resample(self, times: Numbers) -> "Experiment":
         """The record at other times, by linear interpolation. Samples are NaN if a neighbour is missing, and outside
         the record. Samples with a common neighbour no longer have independent noise; use `decimate` to reduce the
-        number of samples."""
+        number of samples.
+
+        **Raises:**
+
+        - `ModelError` for noise whose level differs from sample to sample, or whose correlation is known: that of other
+            neighbours is another.
+        """
         new = _times(times, self.t0)
         if len(self.times) < 2:
             raise ModelError("resample: a record of one sample cannot be interpolated")
@@ -204,6 +225,9 @@ class Experiment:
         varying = [name for name, level in self.levels.items() if np.ndim(level) or self.noise(name).scale is not None]
         if varying:
             raise ModelError(f"resample: '{varying[0]}' has a noise level for each sample: give one for all")
+        for name in self.data:
+            if is_finite(self.noise(name).rho):
+                raise ModelError(f"resample: {_of_neighbours(name)}")
         return self.changed(times=new, data=self._each(between))
 
     @explained_keywords()
@@ -213,15 +237,19 @@ class Experiment:
 
         **Raises:**
 
-        - `ModelError` for uneven sampling times and for missing samples.
+        - `ModelError` for uneven sampling times and missing samples, and for correlated noise, unless both level and
+            correlation are estimated.
         """
-        whole_number(factor, "decimate: factor")
+        factor = whole_number(factor, "decimate: factor")
         steps = np.diff(self.times)
         if len(steps) < factor or np.ptp(steps) > UNEVEN * steps.mean():
             raise ModelError(f"decimate needs more than {factor} samples at even steps: resample(times) makes them so")
         for name, values in self.data.items():
             if np.isnan(values).any():
                 raise ModelError(f"decimate: '{name}' has missing samples, over which no filter goes: window() a part")
+            noise = self.noise(name)
+            if factor > 1 and (is_finite(noise.rho) or (noise.rho is not None and not math.isnan(noise.number))):
+                raise ModelError(f"decimate: {_of_neighbours(name)}")
         response = low_pass(factor) if factor > 1 else np.ones(1)
         quieter = float(np.linalg.norm(response))
         data = self._each(lambda values: smoothed(values, response)[::factor])
@@ -298,6 +326,13 @@ def _rows(
     return (level[rows] if isinstance(level, np.ndarray) else level) * factor
 
 
+def _of_neighbours(name: str) -> str:
+    return (
+        f"the noise of '{name}' is correlated, rho, from one sample to the next, and otherwise from one of the new "
+        "samples to the next: have it estimated, Noise(rho='estimate')"
+    )
+
+
 def _levels_of(name: str, given: Numbers, samples: np.ndarray) -> np.ndarray:
     """A noise level for each sample; one where there is none."""
     levels = np.asarray(given)
@@ -333,7 +368,9 @@ def _times(given: Numbers, t0: float) -> np.ndarray:
     if len(bad):
         raise ModelError(f"times[{bad[0]}] is {times[bad[0]]}: every row needs a time")
     check_increasing(times)
-    if not is_finite(t0) or times[0] < t0:
+    if not is_finite(t0):
+        raise ModelError(f"t0 is the time at which the experiment starts, a number; got {t0!r}")
+    if times[0] < t0:
         raise ModelError(
             f"times lie outside of the experiment: it starts at t0={t0:g}, the times reach from {times[0]:g} to "
             f"{times[-1]:g}. Give t0={times[0]:g}, or leave earlier rows out"
@@ -360,6 +397,25 @@ def _column(frame: Any, name: str) -> Any:
     if name not in known:
         raise ModelError(f"there is no column '{name}': " + nearest(name, [str(k) for k in known]))
     return frame[name]
+
+
+def _numbers(frame: Any, name: str) -> np.ndarray:
+    """A column of numbers."""
+    column = _column(frame, name)
+    try:
+        return np.asarray(column, float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"column '{name}' has cells that are no numbers, such as {_text_in(column)!r}") from error
+
+
+def _text_in(column: Any) -> Any:
+    """The first cell that is no number, and not empty."""
+    for cell in column:
+        try:
+            float(cell or math.nan)
+        except (TypeError, ValueError):
+            return cell
+    return ""
 
 
 def _seconds(column: Any) -> np.ndarray:

@@ -94,12 +94,17 @@ def plot_residuals(objective: Objective, minimum: Minimum, axes: AxesGiven) -> n
 
 
 def plot_history(minimum: Minimum, ax: Axes | None) -> Axes:
-    """Draws how the misfit came down, step by step; returns the axes."""
+    """Draws how the misfit came down, step by step, or of a likelihood of which noise levels are a part, −ln L for each
+    sample; returns the axes."""
     ax = new_axes(ax)
-    history = np.array(minimum.history, float)
-    ax.semilogy(np.sqrt(2 * history / minimum.weights.samples), ".-")
-    ax.set_xlabel("Steps of least squares")
-    ax.set_ylabel("RMS residual / σ")
+    each = np.array(minimum.history, float) / minimum.weights.samples
+    if minimum.found.variance is None:
+        ax.semilogy(np.sqrt(2 * each), ".-")
+        ax.set_ylabel("RMS residual / σ")
+    else:  # of any sign
+        ax.plot(each, ".-")
+        ax.set_ylabel("Cost / sample")
+    ax.set_xlabel("Steps")
     ax.grid(True, which="both", alpha=0.3)
     return ax
 

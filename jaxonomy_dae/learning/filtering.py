@@ -58,7 +58,7 @@ class Filter:
             )
         for name, value in self.noise.items():
             _check(f"Filter: noise of '{name}'", value, positive=True)
-        whole_number(self.substeps, "Filter: substeps")
+        object.__setattr__(self, "substeps", whole_number(self.substeps, "Filter: substeps"))
 
 
 @explained
@@ -207,12 +207,16 @@ def _gains(method: Innovations, system: AcausalSystem, stacked: Stacked) -> list
     given = method.gain
     if isinstance(given, str):
         given = {(state, output): ESTIMATE for state in system.states for output in stacked.outputs}
-    found = []
+    found: list[tuple[str, Level, int, int, float]] = []
     for (state, output), value in given.items():
         place, factor = _state(system, state, "Innovations: gain")
         if output not in stacked.outputs:
             raise ModelError(f"Innovations: there are no data of '{output}': " + nearest(output, stacked.outputs))
-        found.append((f"gain of {state} by {output}", value, place, stacked.outputs.index(output), factor))
+        name, j = f"gain of {state} by {output}", stacked.outputs.index(output)
+        double = [other for other, _, p, k, _ in found if (p, k) == (place, j)]
+        if double:
+            raise ModelError(f"Innovations: the {name} is given twice, also as the {double[0]}")
+        found.append((name, value, place, j, factor))
     return found
 
 

@@ -9,17 +9,26 @@ import scipy.optimize
 import scipy.stats
 from jaxtyping import Float
 
+from ..base.errors import ModelError
 from .at_bounds import AtBound
 from .coordinates import end_text
 from .descent import Minimum
 from .evaluation import Weights
 from .objective import AWAY, Objective
+from .priors import is_finite
 from .table import Row, Table
 
 FURTHEST = 10  # doublings of the linear interval before an end counts as infinite
 # Data that leave more than this part of a prior's spread say nothing: a sample of five times that spread would narrow
 # it as much.
 SILENT = 0.98
+
+
+def checked_level(level: object) -> float:
+    """The probability that an interval is to have, or a `ModelError`."""
+    if not (is_finite(level) and 0 < level < 1):
+        raise ModelError(f"level is a probability between 0 and 1, such as 0.95; got {level!r}")
+    return float(level)
 
 
 def profile(
@@ -34,7 +43,7 @@ def profile(
     - `reach`: `reach(objective, start, weights)` is the minimum next to a start, with weights that stay as they are.
     """
     c = objective.coordinates
-    allowed = 0.5 * float(scipy.stats.chi2.ppf(level, 1))
+    allowed = 0.5 * float(scipy.stats.chi2.ppf(checked_level(level), 1))
     held = np.array(c.fixed)
     held[position] = True
     free = objective.free

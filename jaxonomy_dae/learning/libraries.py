@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import sympy
 from jax.typing import ArrayLike
 
-from ..base.errors import ModelError, explained_keywords, nearest
+from ..base.errors import ModelError, explained_keywords, nearest, whole_number
 from ..graph.expressions.from_sympy import UnsupportedExpression, read, symbols_of
 from ..write.networks import count_outputs, of_scalars
 from .term import AbstractTerm, Inner, OfFunction, Power, Written, inner_of, local_name
@@ -56,9 +56,7 @@ def powers(highest: int) -> Library:
 
     - `ModelError` if `highest` is not a whole number ≥ 1; when used, for blocks with other counts of outputs.
     """
-    if isinstance(highest, bool) or not isinstance(highest, int) or highest < 1:
-        raise ModelError(f"powers(highest) takes a whole number ≥ 1; got {highest!r}")
-    return Library((_Powers(highest),))
+    return Library((_Powers(whole_number(highest, "powers: highest")),))
 
 
 def terms(*expressions: Text | Sequence[Text], **others: Callable[..., ArrayLike] | tuple[float, float]) -> Library:

@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from ..base.errors import ModelError, explained
+from ..base.errors import explained, whole_number
 from .block_elimination import Blocks, eliminate, linear
 from .clock import Clock
 from .descent import FIRST, OFFSET, PATIENCE, SETTLED, TRIALS, Minimum, can_move, damping_after, offset
@@ -56,8 +56,7 @@ class Shooting:
     nodes: int = 30
 
     def __post_init__(self):
-        if not isinstance(self.nodes, int) or isinstance(self.nodes, bool) or self.nodes < 1:
-            raise ModelError(f"Shooting: nodes is a number of segments ≥ 1; got {self.nodes!r}")
+        object.__setattr__(self, "nodes", whole_number(self.nodes, "Shooting: nodes"))
 
 
 @dataclasses.dataclass(frozen=True)

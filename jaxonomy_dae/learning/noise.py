@@ -45,13 +45,16 @@ class Noise:
     rho: float | str | None = None
 
     def __post_init__(self):
-        if self.rho is not None and self.rho != ESTIMATE and not (is_finite(self.rho) and abs(float(self.rho)) < 1):
+        if not (self.rho is None or _is_open(self.rho) or (is_finite(self.rho) and abs(float(self.rho)) < 1)):
             raise ModelError(f"Noise: rho is a correlation between −1 and 1, or 'estimate'; got {self.rho!r}")
         if self.rho is not None and (self.student is not None or self.huber is not None):
             raise ModelError("Noise: errors that are correlated, rho, are normal: leave student and huber out")
-        if self.level != ESTIMATE and not (is_finite(self.level) and float(self.level) > 0):
-            raise ModelError(f"Noise: level is a standard deviation > 0, or 'estimate'; got {self.level!r}")
-        if self.shared and self.level != ESTIMATE:
+        if not (_is_open(self.level) or (is_finite(self.level) and float(self.level) > 0)):
+            raise ModelError(
+                "Noise: level is a standard deviation > 0, or 'estimate'; an array goes into scale=; got "
+                f"{self.level!r}"
+            )
+        if self.shared and not _is_open(self.level):
             raise ModelError(
                 f"Noise: a level that is shared, '{self.shared}', is estimated; it is given as {self.level}"
             )
@@ -81,6 +84,11 @@ class Noise:
     def is_plain(self) -> bool:
         """True for white normal noise with a level of its own, which is the same for all samples."""
         return self.scale is None and not self.shared and self.tails == (math.inf, math.inf) and self.rho is None
+
+
+def _is_open(value: object) -> bool:
+    """True for what is to be estimated."""
+    return isinstance(value, str) and value == ESTIMATE
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

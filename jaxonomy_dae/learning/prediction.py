@@ -52,12 +52,12 @@ def named(objective: Objective, names: str | Sequence[str], experiment: int | st
     """(names of variables and sensor laws, those of arrays by their entries; the place of an experiment)."""
     labels, plan = objective.stacked.labels, objective.system.plan
     k = labels.index(experiment) if experiment in labels else experiment
-    if not isinstance(k, int) or not -len(labels) <= k < len(labels):
+    if isinstance(k, bool) or not isinstance(k, int | np.integer) or not -len(labels) <= k < len(labels):
         raise ModelError(f"there is no experiment {experiment!r}: " + nearest(str(experiment), labels))
     chosen = [names] if isinstance(names, str) else names
     found = [n for name in chosen for n in ([name] if name in objective.observers else plan.entry_names([name]))]
     plan.resolve([name for name in found if name not in objective.observers])
-    return found, k % len(labels)
+    return found, int(k) % len(labels)
 
 
 def under(
@@ -67,7 +67,8 @@ def under(
     s = objective.stacked
     names, k = named(objective, names, experiment)
     times = s.times[k, : s.counts[k]] if ts is None else np.asarray(ts, float)
-    if times.ndim != 1 or not len(times) or (np.diff(times) < 0).any() or times[0] < s.t0[k] or times[-1] <= s.t0[k]:
+    # A comparison with NaN is false.
+    if times.ndim != 1 or not len(times) or not (np.diff(times, prepend=s.t0[k]) >= 0).all() or np.isinf(times[-1]):
         raise ModelError(f"ts must be increasing times, of shape (n,), that start at {s.t0[k]:g} or later")
     layout = dataclasses.replace(objective.layout, outputs=tuple(names), mesh=None, lengths=())
     system, observers = objective.system, objective.observers

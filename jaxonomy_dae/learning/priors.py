@@ -9,9 +9,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias, TypeGuard
 
+import jax
 import numpy as np
 
 from ..base.errors import ModelError, explained, nearest
+from ..host.staging import is_traced
 from ..run.system.parameters import ParameterNames
 
 
@@ -89,6 +91,12 @@ def _checked(name: str, prior: Any, table: ParameterNames) -> Prior:
     if not (low < high and interval.low <= low and high <= interval.high):
         raise ModelError(f"priors: the range of '{name}' must lie in {interval}, as declared; got ({low:g}, {high:g})")
     return low, high
+
+
+def unwrapped(value: Any) -> Any:
+    """The number in an array of no axes, of NumPy or JAX; anything else as it is."""
+    is_number = isinstance(value, np.ndarray | jax.Array) and value.ndim == 0 and not is_traced(value)
+    return value.item() if is_number else value
 
 
 def is_finite(value: object) -> TypeGuard[float]:

@@ -28,6 +28,7 @@ from .asked import METHODS, as_asked, check_start, checked_method, dead_times, n
 from .beginnings import GROWING as GRADUAL
 from .beginnings import beginning, silent
 from .clock import Clock
+from .colour import check_steps
 from .colour_search import correlated
 from .coordinates import Coordinate, Coordinates, coordinates
 from .data import Data, Stacked, stack
@@ -49,7 +50,7 @@ from .resolution import resolved
 from .runs import residuals, run, why_not
 from .smoother import smoother
 from .starting_points import adam_steps, starting_points
-from .training import GradientSteps, Training, train
+from .training import GradientSteps, Training, shares_of_time, train
 from .verdict import FitWarning
 
 GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
@@ -155,7 +156,10 @@ class Problem:
         self.trained = names_to_train(system, self.observers, train)
         self.method = checked_method(system, method)
         self.delay = by_name("delay", delay, "'motor.u': Unknown(0.1)")
-        self._stacked = self.stacked(self.data)
+        self._stacked = self._read(self.data, None)
+        unseen = [n for n in self.observers if n in self.trained[1] and n not in self._stacked.outputs]
+        if unseen:
+            raise ModelError(f"train: there are no data of '{unseen[0]}' to train its sensor law with")
         self._layout = self.layout_of(self._stacked)
         unknown = [*self.trained[0], *self._layout.shared, *self._layout.own]
         table = system.parameters.table
@@ -170,13 +174,11 @@ class Problem:
 
     def stacked(self, data: Data | Experiment) -> Stacked:
         """The data, checked against the model, as arrays."""
-        stacked = stack(
-            data if isinstance(data, Data) else Data(data), self.system.plan, tuple(self.observers), self.starts
-        )
-        unused = [name for name in self.observers if name not in stacked.outputs]
-        if unused and unused[0] in self.trained[1]:
-            raise ModelError(f"train: there are no data of '{unused[0]}' to train its sensor law with")
-        return stacked
+        return self._read(data, self._stacked)
+
+    def _read(self, data: Data | Experiment, like: Stacked | None) -> Stacked:
+        whole = data if isinstance(data, Data) else Data(data)
+        return stack(whole, self.system.plan, tuple(self.observers), self.starts, like)
 
     def layout_of(self, stacked: Stacked) -> Layout:
         """The names of arguments and results of a program for these data."""
@@ -259,6 +261,7 @@ class Problem:
         """The function that a fit minimises."""
         if self.method not in METHODS:
             stacked.check_plain(f"method={type(self.method).__name__}")
+        check_steps(stacked)
         return Objective(
             self.system, self.observers, self.layout_of(stacked), 1.0, stacked, c,
             penalties=self.penalties if penalties is None else penalties, counted=~stacked.holdout,
@@ -326,6 +329,7 @@ class Problem:
         """
         clock = Clock(timeout)
         count = 1 if starts is None else whole_number(starts, "starts")
+        steps, adam = whole_number(steps, "steps", 0), whole_number(adam, "adam", 0)
         objective = self._prepared(data, freeze, start, bounds)
         objective = dataclasses.replace(objective, watch=reporter(progress, OFFSET), clock=clock)
         if first is not None and (adam or (count > 1 and first.checkpoint is not None)):
@@ -335,9 +339,7 @@ class Problem:
         plain = self.method == "single" and horizons is None and start is None and first is None and not adam
         if horizons is None:
             horizons = GROWING if self.method == "growing" else (1.0,)
-        shares = tuple(float(share) for share in horizons)
-        if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
-            raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
+        shares = shares_of_time(horizons)
         by_fit = isinstance(self.method, Filter) or not objective.stacked.holdout.any()
         objective, own, fresh = in_ranges(
             objective, silent(objective, self._nominal(objective)), not isinstance(self.method, Shooting)

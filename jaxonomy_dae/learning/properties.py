@@ -86,7 +86,7 @@ def properties(fit: "Estimate", name: str) -> Properties:
 
 def _evidence(fit: "Estimate") -> float:
     m = fit.minimum
-    return log_evidence(m.z, m.found, m.weights)
+    return log_evidence(m.z, m.found, m.weights) - fit.objective.colour.log_scale(m.weights.share)
 
 
 def _kinds(fit: "Estimate", name: str, net: eqx.nn.MLP) -> dict[str, Callable[[Any], Any]]:

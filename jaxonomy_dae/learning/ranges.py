@@ -80,7 +80,9 @@ def _places(objective: Objective, name: str) -> Int[np.ndarray, " w"] | None:
     if type(net) is not eqx.nn.MLP or len(net.layers) < 2 or objective.penalties.get(name) != "evidence":
         return None
     at = np.flatnonzero(np.array([group == name for group in c.group]) & c.is_weight)
-    return at if objective.free[at].all() else None
+    # Bounds are those of the numbers themselves, and not of what biases are at the centre.
+    is_bounded = np.isfinite(c.low[at]).any() or np.isfinite(c.high[at]).any()
+    return at if objective.free[at].all() and not is_bounded else None
 
 
 def _asked(net: Any, points: Float[np.ndarray, "m inputs"]) -> Float[np.ndarray, "n inputs"]:

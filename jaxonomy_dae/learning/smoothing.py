@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from ..base.errors import ModelError
+from ..base.errors import ModelError, whole_number
 from .filter_data import Told
 from .filter_program import Ahead, Track, go_on, read_states
 from .objective import Objective
@@ -31,7 +31,8 @@ def followed(
     s = objective.stacked
     names, k = named(objective, names, experiment)
     count = s.counts[k]
-    if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= count:
+    steps = whole_number(steps, "steps")
+    if steps > count:
         raise ModelError(f"steps is a whole number from 1 to the {count} samples of this experiment; got {steps!r}")
     found = jax.tree.map(lambda a: a[k, :count], objective.predictions(point))
     first = 0

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..base.errors import ModelError, nearest
 from ..base.optional import Axes, new_axes
 
 
@@ -30,7 +31,10 @@ class Table:
     level: float
 
     def __getitem__(self, name: str) -> Row:
-        return next(row for row in self.rows if row.name == name)
+        for row in self.rows:
+            if row.name == name:
+                return row
+        raise ModelError(f"there is no row '{name}' in this table: " + nearest(name, [row.name for row in self.rows]))
 
     def __iter__(self):
         return iter(self.rows)

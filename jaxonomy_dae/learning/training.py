@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,6 +23,17 @@ from .evaluation import Evaluation, Weights
 from .gradient import Batches
 from .objective import Objective
 from .runs import why_not
+
+
+def shares_of_time(given: Any) -> tuple[float, ...]:
+    """The horizons that are given, if they are shares of the time and end with all of it."""
+    try:
+        shares = tuple(float(share) for share in given)
+    except (TypeError, ValueError):
+        shares = ()
+    if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
+        raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {given!r}")
+    return shares
 
 
 @explained
@@ -58,16 +70,11 @@ class GradientSteps:
     def __post_init__(self):
         if not isinstance(self.optimizer, optax.GradientTransformation):
             raise ModelError(f"optimizer must be one of Optax, such as optax.adam(0.02); got {self.optimizer!r}")
-        whole_number(self.steps, "GradientSteps: steps", 0)
-        whole_number(self.every, "GradientSteps: every")
-        if self.batch is not None:
-            whole_number(self.batch, "GradientSteps: batch")
-        if self.patience is not None:
-            whole_number(self.patience, "GradientSteps: patience")
-        shares = tuple(float(share) for share in self.horizons)
-        if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
-            raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {self.horizons!r}")
-        object.__setattr__(self, "horizons", shares)
+        for name, least in (("steps", 0), ("every", 1), ("batch", 1), ("patience", 1)):
+            given = getattr(self, name)
+            if given is not None or name in ("steps", "every"):
+                object.__setattr__(self, name, whole_number(given, f"GradientSteps: {name}", least))
+        object.__setattr__(self, "horizons", shares_of_time(self.horizons))
 
     def share(self, step: int) -> float:
         """The horizon of a step."""
@@ -166,6 +173,8 @@ def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSt
     held_out = bool(objective.stacked.holdout.any())
     if plan.patience is not None and not held_out:
         raise ModelError("patience needs experiments that are held out: Experiment(..., holdout=True)")
+    if plan.checkpoint is not None and not Path(plan.checkpoint).parent.is_dir():
+        raise ModelError(f"checkpoint: there is no folder for '{plan.checkpoint}': make it first")
     low, high = objective.limits
     near = silent(objective, start)
     stages = {share: Batches(objective.until(share, near), plan.batch, plan.seed) for share in plan.horizons}

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from ..base.errors import ModelError, SimulationError
+from ..base.errors import ModelError, SimulationError, whole_number
 from .data import Data, Stacked
 from .experiment import Experiment
 from .factors import Factors
@@ -54,8 +54,7 @@ class Unseen:
         """
         if not isinstance(experiment, Experiment):
             raise ModelError(f"new data are an Experiment; got a {type(experiment).__name__}")
-        if first is not None and (isinstance(first, bool) or not isinstance(first, int) or first < 1):
-            raise ModelError(f"first is a number of rows ≥ 1, or None for all; got {first!r}")
+        first = None if first is None else whole_number(first, "first, the number of rows,")
         problem, fitted = estimate.problem, estimate.objective
         stacked = with_noise_of(fitted, problem.stacked(Data(experiment.changed(holdout=False, weight=1.0))))
         c = problem.coordinates_of(fitted.setting._replace(layout=problem.layout_of(stacked)), stacked)

@@ -71,7 +71,7 @@ def stick_slip(
     else:
         component.when(pressed <= 0, assign(mode, 2), on=Ne(mode, 2), at_start=True)
         component.when(pressed > 0, assign(mode, direction), on=Eq(mode, 2), at_start=True)
-        component.when(And(mode * speed <= 0, pressed > 0), assign(mode, 0), on=moving)
+        component.when(And(mode * speed < 0, pressed > 0), assign(mode, 0), on=moving)
     # Not more than twice the breakaway, so that friction that no source lets hold leaves the guard its size.
     component.when(smooth(Min(Abs(friction), 2 * breakaway)) >= breakaway, assign(mode, sign(friction)), on=stuck)
     # A source that jumps to a speed, as an interpolated position does, moves parts without acceleration.

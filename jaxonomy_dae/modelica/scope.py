@@ -26,7 +26,7 @@ from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
-from .tree import Assignment, Class, Declaration, Equality, Expression, Reference, Truth, entry_name
+from .tree import Assignment, Call, Class, Declaration, Equality, Expression, Reference, Truth, each_part, entry_name
 from .values import Record, Value, as_number, both, is_condition, negated, plain
 from .written_out import entries_of, unrolled
 
@@ -406,7 +406,22 @@ class Scope:
         return read(table, column, u, *more)
 
     def _pre(self, e: Expression) -> Value:
-        return previous(self.evaluate(e))
+        value = self.evaluate(e)
+        for s in _variables(value):
+            # A state jumps by `reinit` alone, at the end of an iteration: until then it is what it was before.
+            if not s.path.startswith(":") and s.path not in self.states:
+                raise ModelError(
+                    f"pre({s.path}): '{s.path}' is neither discrete nor a state, and may jump with others at the "
+                    f"instant: what it was before is not kept. Write pre(…) of what its equation reads"
+                )
+        return previous(value)
+
+    @functools.cached_property
+    def states(self) -> set[str]:
+        """The variables of which equations read the derivative."""
+        parts = each_part((self.flat.model.equations, self.flat.model.algorithms))
+        calls = (p for p in parts if isinstance(p, Call) and p.function == "der")
+        return {s.path for c in calls for s in _variables(self.evaluate(c.arguments[0]))}
 
     def _edge(self, e: Expression) -> Value:
         now = self.evaluate(e)
@@ -425,6 +440,16 @@ class Scope:
 
 def _is_of_parameters(value: sympy.Expr) -> bool:
     return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols_of(value))
+
+
+def _variables(value: Value) -> list[VariableSymbol]:
+    """The continuous variables in a value."""
+    if isinstance(value, list):
+        return [s for v in value for s in _variables(v)]
+    if isinstance(value, Record):
+        return [s for v in value.values() for s in _variables(v)]
+    found = symbols_of(value) if isinstance(value, sympy.Basic) else ()
+    return [s for s in found if isinstance(s, VariableSymbol)]
 
 
 T = TypeVar("T")

@@ -52,6 +52,7 @@ def assert_passive(
     - `ModelError` for a law whose size or inputs are not known, and for outputs that do not fit.
     """
     typical, size = _typical(law, size, inputs)
+    weights, count = whole_number(weights, "assert_passive: weights", 0), whole_number(count, "assert_passive: count")
     dtype = jnp.asarray(typical).dtype
     allowed = ROUNDING * float(jnp.finfo(dtype).eps) if rtol is None else float(rtol)
     rng = np.random.default_rng(seed)

@@ -311,7 +311,7 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         - `fixed`, `nominal`, `unit`, `bounds`: of all entries, as in `variable`. An entry without a start is not fixed.
         """
         self._claim(name, "variable")
-        if not isinstance(count, int) or count < 1:
+        if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
             raise ModelError(f"vector variable '{self.name}.{name}' needs a positive number of entries; got {count!r}")
         is_sequence = isinstance(start, Sequence | np.ndarray) and not isinstance(start, str)
         starts = list(start) if is_sequence else [start] * count

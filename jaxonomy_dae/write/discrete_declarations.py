@@ -13,7 +13,7 @@ from .discrete_equations import DiscreteEquations
 from .events import Assign
 from .interval import Interval
 from .relation_declarations import RelationDeclarations
-from .symbols import DiscreteSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
+from .symbols import DiscreteSymbol, EarlierSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
 from .truths import as_number
 
 _JUMPING = (sympy.Piecewise, sympy.core.relational.Relational, sympy.sign, sympy.Heaviside, *ROUNDING)
@@ -50,8 +50,8 @@ class DiscreteDeclarations(RelationDeclarations):
 
         **Raises:**
 
-        - `ModelError` for what is not a discrete variable of this component, for a second equation, and for a value
-            that changes between events.
+        - `ModelError` for what is not a discrete variable of this component, for a second equation, for a value that
+            changes between events, and for `pre(y)` of a variable that does.
         """
         self._check_open("add its discrete equations")
         where = f"component '{self.name}': discrete_equation"
@@ -64,6 +64,14 @@ class DiscreteDeclarations(RelationDeclarations):
         found = sympy.sympify(value)
         if isinstance(value, str) or not isinstance(found, sympy.Expr | Boolean):
             raise ModelError(f"{where}({variable}, …): the value is a condition or an expression; got {value!r}")
+        earlier = sorted((s for s in found.free_symbols if isinstance(s, EarlierSymbol)), key=str)
+        if earlier:
+            y = earlier[0].path
+            raise ModelError(
+                f"{where}({variable}, …): {earlier[0]} is not kept: '{y}' changes between events. Write {y} for "
+                f"what it is at the instant, or let an event assign it to a discrete variable, "
+                f"self.when(…, assign(d, pre({y})))"
+            )
         flows = next(_flowing(found), None)
         if flows is not None:
             raise ModelError(

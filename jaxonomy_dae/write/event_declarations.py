@@ -23,7 +23,7 @@ from .events import (
     relation_in_discretes,
     while_on,
 )
-from .symbols import DiscreteSymbol, PreviousSymbol, RelationSymbol, VariableSymbol
+from .symbols import DiscreteSymbol, EarlierSymbol, PreviousSymbol, RelationSymbol, VariableSymbol
 
 
 class EventDeclarations:
@@ -40,7 +40,9 @@ class EventDeclarations:
     _declare: Callable[..., VariableSymbol]
     _declare_parameter: Callable[..., str]
     _check_parameters_only: Callable[[sympy.Expr, str], None]
+    as_written: dict[sympy.Expr, sympy.Expr]
     _without_jumps: Callable[[Condition], Condition]
+    _strict_apart: Callable[[Condition], Condition]
 
     def discrete(self, name: str, start: Value = 0.0, unit: str = "") -> DiscreteSymbol:
         """Declares a discrete variable: constant but for the events that assign it.
@@ -136,27 +138,33 @@ class EventDeclarations:
         guard, shown = None, text or f"sampled({getattr(clock, 'period', '')})"
         if clock is None:
             shown = text or (str(condition) if on is None else f"{condition}, on={on}")
-            watchable = (
-                condition if EventFlag.RELATION in flags else self._without_jumps(condition)
-            )  # which may add events
-            expression = guard_of(watchable, where)
-            if on is not None:
-                expression = while_on(expression, relation_in_discretes(on, f"{where}, on"))
-            expression = while_on(expression, watched)
+            own = condition if EventFlag.RELATION in flags else self._without_jumps(condition)
+            watchable = self._strict_apart(own)  # either may add events
+            expression = self._guard(watchable, on, watched, where)
+            if is_strict(watchable):
+                flags |= EventFlag.STRICT
             symbols = symbols_of(expression)
             changing = (VariableSymbol, DiscreteSymbol, RelationSymbol)
             if not any(isinstance(s, changing) or s is self.ev.t for s in symbols):
                 raise ModelError(f"{where}({condition}): the condition contains no variable: it never changes")
-            past = [s for s in symbols if isinstance(s, PreviousSymbol)]
+            past = [s for s in symbols if isinstance(s, PreviousSymbol | EarlierSymbol)]
             if past:
                 raise ModelError(f"{where}({condition}): a condition is on the present: write {past[0].path}")
             guard = self._hidden(f":when[{len(self.events)}]", expression)
+            if watchable is not own:  # units are told in the user's words
+                hidden = self.equations[-1]
+                self.as_written[hidden] = hidden + expression - self._guard(own, on, watched, where)
         elif on is not None:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
         values = self._values(actions, len(self.events), where)
-        if is_strict(condition):
-            flags |= EventFlag.STRICT
         self.events.append(When(shown, guard, clock, tuple(actions), values, flags))
+
+    def _guard(self, condition: Condition, on: Condition, watched: Condition, where: str) -> sympy.Expr:
+        """The guard of a condition, there only while `on` and `watched` hold."""
+        guard = guard_of(condition, where)
+        if on is not None:
+            guard = while_on(guard, relation_in_discretes(on, f"{where}, on"))
+        return while_on(guard, watched)
 
     def _hidden(self, name: str, expression: sympy.Expr) -> str:
         """Declares a variable that equals an expression, and is not shown."""
@@ -187,7 +195,7 @@ class EventDeclarations:
             if isinstance(action, Terminate):
                 values.append(None)
                 continue
-            value = _with_new_values(action.value, new, (), where)
+            value = _as_read(_with_new_values(action.value, new, (), where))
             if value.is_number:
                 values.append(float(value))
             elif isinstance(value, VariableSymbol) and value.path.startswith(":when"):  # it stands for a value already
@@ -195,6 +203,12 @@ class EventDeclarations:
             else:
                 values.append(self._hidden(f":when[{number},{k}]", value))
         return tuple(values)
+
+
+def _as_read(value: Expression) -> Expression:
+    """A value of an action in what actions read: continuous variables before the event, with or without `pre`."""
+    earlier = [s for s in value.free_symbols if isinstance(s, EarlierSymbol)]
+    return value.xreplace({s: VariableSymbol(s.path, s.order) for s in earlier})
 
 
 def _with_new_values(value: Expression, new: dict, above: tuple, where: str) -> Expression:

@@ -11,7 +11,15 @@ from ..base.aliases import Condition
 from ..base.errors import ModelError
 from ..graph.expressions.from_sympy import symbols_of
 from .declarations import Value
-from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, RelationSymbol, TimeSymbol, VariableSymbol
+from .symbols import (
+    DiscreteSymbol,
+    EarlierSymbol,
+    ParameterSymbol,
+    PreviousSymbol,
+    RelationSymbol,
+    TimeSymbol,
+    VariableSymbol,
+)
 
 
 class EventFlag(enum.Flag):
@@ -128,7 +136,7 @@ def pre(symbol: sympy.Symbol) -> sympy.Expr:
     if isinstance(symbol, DiscreteSymbol):
         return PreviousSymbol(symbol.path)
     if isinstance(symbol, VariableSymbol):
-        return symbol  # actions read continuous variables before the event anyway
+        return EarlierSymbol(symbol.path, symbol.order)
     raise ModelError(f"pre takes a variable or a discrete variable; got {symbol}")
 
 
@@ -142,7 +150,7 @@ def reinit(variable: sympy.Symbol, value: Value) -> Reinit:
     if isinstance(variable, ParameterSymbol):
         kind = "discrete variable: write assign(…)" if isinstance(variable, DiscreteSymbol) else "parameter"
         raise ModelError(f"reinit takes a variable; '{variable}' is a {kind}")
-    if not isinstance(variable, VariableSymbol):
+    if not isinstance(variable, VariableSymbol) or isinstance(variable, EarlierSymbol):
         raise ModelError(f"reinit takes a variable; got {variable}")
     return Reinit(variable, _expression(value, f"reinit({variable}, …)"))
 
@@ -221,12 +229,29 @@ def has_guard(condition: Condition) -> bool:
 
 
 def is_strict(condition: Condition) -> bool:
-    """True for conditions with a relation that is false where its sides are equal; False for clocks."""
+    """True for a condition that is false where its guard is zero.
+
+    Of several relations that `and` or `or` joins, those whose sides are equal there decide; so they are of one kind,
+    all strict or none. Relations in discrete variables are not among them: they switch the guard, which jumps.
+    """
+    return any(isinstance(r, sympy.StrictLessThan | sympy.StrictGreaterThan) for r in _moving_relations(condition))
+
+
+def is_of_both_kinds(condition: Condition) -> bool:
+    """True if `and` or `or` joins strict relations with others."""
+    joined = isinstance(condition, sympy.And | sympy.Or | sympy.Not)
+    return joined and len({is_strict(r) for r in _moving_relations(condition)}) > 1
+
+
+def _moving_relations(condition: Condition) -> list[Condition]:
+    """The relations in variables or time, as they stand once `not` is carried inside."""
+    if _is_discrete(condition):
+        return []
     if isinstance(condition, sympy.Not):
-        return is_strict(to_nnf(condition))
+        return _moving_relations(to_nnf(condition))
     if isinstance(condition, sympy.And | sympy.Or):
-        return any(is_strict(c) for c in condition.args)
-    return isinstance(condition, sympy.StrictLessThan | sympy.StrictGreaterThan)
+        return [r for c in condition.args for r in _moving_relations(c)]
+    return [condition]
 
 
 def while_on(guard: sympy.Expr, condition: Condition) -> sympy.Expr:

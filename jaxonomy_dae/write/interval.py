@@ -24,6 +24,12 @@ class Interval:
     open_low: bool = False
     open_high: bool = False
 
+    def __post_init__(self):
+        # Infinity is no value, so an end there leaves nothing out by being open. Whoever reads `open_low` may then take
+        # it for a number beside the interval.
+        object.__setattr__(self, "open_low", bool(self.open_low and math.isfinite(self.low)))
+        object.__setattr__(self, "open_high", bool(self.open_high and math.isfinite(self.high)))
+
     def __contains__(self, value: float) -> bool:
         above = self.low < value if self.open_low else self.low <= value
         below = value < self.high if self.open_high else value <= self.high

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import numpy as np
 import sympy
 
 from ..base.aliases import Condition, Expression
@@ -10,7 +11,7 @@ from .declarations import Parameter, Value, Variable
 from .discrete_declarations import DiscreteDeclarations
 from .equations import zero_of
 from .events import NO_FLAG, Assign, EventFlag, HeldBranch, Terminate, relation_in_discretes
-from .symbols import DiscreteSymbol, RelationSymbol, der
+from .symbols import DiscreteSymbol, RelationSymbol, TimeSymbol, VariableSymbol, der
 
 # Modes of `sliding` at an instant, beside 1, −1 and 0: the solution begins somewhere, may be on the surface and reads
 # the field above it or below it, or leaves it to above if the field below does not lead away, too.
@@ -71,8 +72,8 @@ class ModeDeclarations(DiscreteDeclarations):
             further ones of this component.
 
         A solution that crosses the surface, as both fields lead to one side, crosses at once. One that begins on it
-        slides, or goes where both fields lead. If they lead away to both sides, the run ends there and says so: it has
-        more than one solution.
+        slides, or goes where both fields lead. If they lead away to both sides, there or later on the way, the run ends
+        and says so: it has more than one solution.
 
         **Returns:**
 
@@ -88,13 +89,19 @@ class ModeDeclarations(DiscreteDeclarations):
         tried = tuple((above, sympy.Eq(side, mode)) for mode in (_ON_IT, 1, _ABOVE_IS_TRIED))
         branch = sympy.Piecewise(*tried, (below, True))
         self._either(sympy.Eq(side, 0), surface, branch, 1, None)
+        rate, jump = der(surface), below - above
         # `part` is the a of a·above + (1 − a)·below = 0 in what holds the solution on the surface.
-        rate, part = der(surface), below / (below - above)
+        part = below / jump
+        # Where the fields become equal and change places without leaving the mixture, both lead away from there on.
+        changes = any(
+            isinstance(s, VariableSymbol | DiscreteSymbol | TimeSymbol) for s in sympy.sympify(jump).free_symbols
+        )
+        drawn = self._hidden_discrete(0.0) if changes else None
 
-        def moves(condition: Condition, mode: int, to: Value, flags: EventFlag = NO_FLAG) -> None:
+        def moves(condition: Condition, mode: int, to: Value, flags: EventFlag = NO_FLAG, *others: Assign) -> None:
             """Declares an event that takes one mode to another."""
             on: Condition = sympy.Eq(side, mode)
-            self._event(condition, (Assign(side, sympy.sympify(to)),), on, flags)
+            self._event(condition, (Assign(side, sympy.sympify(to)), *others), on, flags)
 
         first = sympy.Piecewise((1, surface > 0), (-1, surface < 0), (_ABOVE_IS_TRIED, True))
         moves(sympy.Eq(side, _ON_IT), _ON_IT, first, EventFlag.AT_START)
@@ -103,12 +110,16 @@ class ModeDeclarations(DiscreteDeclarations):
         moves(surface >= 0, -1, _ABOVE_IS_TRIED, EventFlag.LISTED)
         moves(rate < 0, _ABOVE_IS_TRIED, _BELOW_IS_TRIED)
         moves(rate >= 0, _ABOVE_IS_TRIED, _LEAVES_ABOVE)
-        moves(rate > 0, _BELOW_IS_TRIED, 0)
+        moves(rate > 0, _BELOW_IS_TRIED, 0, NO_FLAG, *([] if drawn is None else [Assign(drawn, sympy.sign(jump))]))
         moves(rate <= 0, _BELOW_IS_TRIED, -1)
         moves(rate >= 0, _LEAVES_ABOVE, 1)
         both = f"on the surface {surface} = 0 of component '{self.name}', both fields lead away: begin beside it"
         leaves: Condition = sympy.Eq(side, _LEAVES_ABOVE)
         self._event(rate < 0, (Terminate(both),), leaves, EventFlag.LISTED)
+        if drawn is not None:
+            turned = f"along the surface {surface} = 0 of component '{self.name}', both fields lead away from here on"
+            gone = Terminate(f"{turned}: the solution may stay, or leave to either side")
+            self._event(drawn * jump < 0, (gone,), sympy.Eq(side, 0), EventFlag.LISTED)
         moves(part >= 1, 0, 1, EventFlag.LISTED)
         moves(part <= 0, 0, -1, EventFlag.LISTED)
         return side
@@ -193,7 +204,7 @@ class ModeDeclarations(DiscreteDeclarations):
         act: 1 takes away the lowest derivative that may jump, 1 + e gives back the part e of it. `pushes` is the mode
         of a branch whose force is never negative."""
         where = f"component '{self.name}': either"
-        if isinstance(order, bool) or order not in range(HIGHEST + 1):
+        if isinstance(order, bool) or not isinstance(order, int | np.integer) or order not in range(HIGHEST + 1):
             raise ModelError(f"{where}: order says how many times a branch is differentiated, 0, 1 or 2; got {order!r}")
         then, otherwise = (_expression(zero_of(b), f"{where}: the branch") for b in (then, otherwise))
         if not order:

@@ -1,13 +1,13 @@
 """Relations in a component's equations whose changes are events: declared, or found when the component is complete."""
 
 import sympy
-from sympy.logic.boolalg import BooleanAtom
+from sympy.logic.boolalg import BooleanAtom, to_nnf
 
 from ..base.aliases import Condition, Expression
 from ..graph.expressions.to_sympy import shortened
 from .automatic_events import Splitting, Stepping, Turning, jumps, turned, varies, with_events
 from .event_declarations import EventDeclarations
-from .events import LIVE, NO_FLAG, Assign, EventFlag, Sampled, is_strict
+from .events import LIVE, NO_FLAG, Assign, EventFlag, Sampled, is_of_both_kinds, is_strict
 from .symbols import PreviousSymbol, RelationSymbol, VariableSymbol
 from .timed_relations import Edges
 
@@ -50,8 +50,23 @@ class RelationDeclarations(EventDeclarations):
         if numbers.timed and not varies(guarded):
             return live, guarded
         known: Condition = self._hidden_discrete(float(LIVE))
-        self._turns(Turning(known.number, self._without_jumps(guarded), sympy.true))
+        self._turns(Turning(known.number, self._strict_apart(self._without_jumps(guarded)), sympy.true))
         return turned(known.number, condition), sympy.Eq(known, 1)
+
+    def _strict_apart(self, condition: Condition) -> Condition:
+        """The condition as one guard can tell it, with relations of one kind.
+
+        Where the guard is zero the condition is that of the relation whose sides are equal, and a guard knows only
+        whether all of its relations are strict. So strict ones among others are events of their own.
+        """
+        return self._strict_alone(condition) if is_of_both_kinds(condition) else condition
+
+    def _strict_alone(self, condition: Condition) -> Condition:
+        if isinstance(condition, sympy.Not):
+            return self._strict_alone(to_nnf(condition))
+        if isinstance(condition, sympy.And | sympy.Or):
+            return condition.func(*map(self._strict_alone, condition.args))
+        return self._alone(condition) if is_strict(condition) else condition
 
     def _without_jumps(self, condition: Condition) -> Condition:
         """The condition for a guard that turns where sides jump, as floor(x) does, and moves with these jumps: such a
@@ -69,10 +84,12 @@ class RelationDeclarations(EventDeclarations):
         return own if is_strict(condition) else self._turning_alone(condition, own)
 
     def _turning_alone(self, condition: Condition, own: Condition) -> Condition:
-        if own == condition or not isinstance(own, _ORDERED):
-            return own
+        return own if own == condition or not isinstance(own, _ORDERED) else self._alone(own)
+
+    def _alone(self, relation: Condition) -> Condition:
+        """Declares the events of a relation. Returns the truth that the last of them has left."""
         known = self._hidden_discrete(float(LIVE))
-        self._turns(Turning(known.number, own, sympy.true))
+        self._turns(Turning(known.number, relation, sympy.true))
         return sympy.Eq(known, 1)
 
     def _as_variable(self, side: Expression) -> VariableSymbol:
@@ -90,7 +107,8 @@ class RelationDeclarations(EventDeclarations):
         new, watched = with_events(tuple(map(self._as_kept, self.equations)), len(self.relations))
         if not watched and all(n is e for n, e in zip(new, self.equations, strict=True)):
             return
-        self.as_written = {n: e for n, e in zip(new, self.equations, strict=True) if n is not e}
+        before, pairs = self.as_written, [*zip(new, self.equations, strict=True)]
+        self.as_written = {n: before.get(e, e) for n, e in pairs if n is not e or e in before}
         self.equations[:] = new
         for each in watched:
             self.relations.extend(each.starts)

@@ -10,6 +10,7 @@ import functools
 import sys
 from typing import Any, SupportsFloat
 
+import numpy as np
 import sympy
 
 from ..base.aliases import Condition
@@ -69,6 +70,18 @@ class VariableSymbol(ComponentSymbol):
 
     def __getnewargs_ex__(self):
         return (self.path, self.order), {}
+
+
+class EarlierSymbol(VariableSymbol):
+    """A variable before the event that is being handled, in what an event writes."""
+
+    __slots__ = ()
+
+    @functools.lru_cache(maxsize=65536)  # noqa: B019
+    def __new__(cls, path: str, order: int = 0):
+        symbol = ComponentSymbol.__new__(cls, f"pre({'der(' * order}{path}{')' * order})", real=True)
+        symbol.path, symbol.order = path, order
+        return symbol
 
 
 class ParameterSymbol(ComponentSymbol):
@@ -167,7 +180,7 @@ def symbol_label(symbol: sympy.Symbol) -> tuple:
 
 def seen_from_child(value: Any) -> Any:
     """An argument of a component that is being made: symbols in it, of the place where it is made, get `../` paths."""
-    if isinstance(value, sympy.Basic):
+    if isinstance(value, sympy.Basic | sympy.MatrixBase):  # a matrix that may be written to is no `Basic`
         outside: dict[sympy.Basic, sympy.Basic] = {}
         # Time is the same symbol everywhere, and gets no path.
         for s in value.free_symbols:
@@ -180,8 +193,15 @@ def seen_from_child(value: Any) -> Any:
         return value.xreplace(outside) if outside else value
     if type(value) in (list, tuple):
         return type(value)(seen_from_child(v) for v in value)
+    if isinstance(value, tuple) and hasattr(value, "_fields"):  # with names for its entries
+        return type(value)(*map(seen_from_child, value))
     if type(value) is dict:
         return {k: seen_from_child(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        out = np.empty(value.shape, object)
+        for place, v in np.ndenumerate(value):
+            out[place] = seen_from_child(v)
+        return out
     return value
 
 

@@ -143,7 +143,8 @@ def _with_one_head(e: Expression) -> tuple[Expression, Expression, Expression] |
         if None in parts or len(heads) != 1:
             return None
         slopes, _, rests = zip(*parts, strict=True)  # pyright: ignore[reportArgumentType]
-        return sympy.Add(*slopes), heads.pop(), sympy.Add(*rests)
+        slope = sympy.Add(*slopes)
+        return slope, heads.pop() if slope != 0 else None, sympy.Add(*rests)
     if isinstance(e, sympy.Mul):
         constant = [a for a in e.args if not _changes(a)]
         changing = [a for a in e.args if _changes(a)]

@@ -21,6 +21,7 @@ from jaxonomy_dae.library import signal as sig
 from jaxonomy_dae.write.automatic_events import relations_left_alone
 from jaxonomy_dae.write.events import guard_of, has_guard
 from jaxonomy_dae.write.symbols import DiscreteSymbol, VariableSymbol
+from jaxonomy_dae.write.timed_relations import edges_of, whole_edges
 
 
 def clock_hand(self):
@@ -151,3 +152,15 @@ def test_a_jump_inside_a_condition_is_an_event():
     # A kink that does not jump is still left alone there.
     (left,) = relations_left_alone(w - sympy.Piecewise((1, sympy.Abs(w) >= 1), (0, True)))
     assert left.args[0] == sympy.Abs(w)
+
+
+def test_a_relation_in_which_time_cancels():
+    """Of a·(t + 1) − a·t > ½ nothing is left that turns: it was divided by its slope in time, zero."""
+
+    def write(c, ev):
+        a, x = c.parameter("a", 2.0), c.variable("x", start=0.0, fixed=True)
+        still = a * (ev.t + 1) - a * ev.t
+        assert edges_of(still > 0.5) is whole_edges(still) is None
+        c.add_equations(Eq(der(x), sympy.Piecewise((a, still > 0.5), (0, True))))
+
+    assert not model(write).plan.events.n_clocks

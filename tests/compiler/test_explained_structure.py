@@ -298,6 +298,13 @@ CASES = {
         "the equation m: 0 = M*der(v) - flange.f determines nothing for m.M = 0: the coefficient of what it should "
         "determine is zero. Give other values, or leave the component out.",
     ),
+    "a switch that fixes a state": (
+        lambda: law("x y", lambda c: [c.either(Eq(c.discrete("d"), 0), c.x, c.y + c.x), Eq(der(c.x), c.y)][1]),
+        "the equation c: 0 = Piecewise((x, Eq(d, 0)), (x + y, True)) determines nothing in the mode c.d = 0: the "
+        "coefficient of what it should determine is zero. If it fixes a state there, put storage between what switches "
+        "and that state (a capacitor, a volume of fluid), or let the mode hold the state back, with "
+        "self.complementary(state, other, order=1) or self.either(…, order=1)",
+    ),
     "masses that cancel": (
         lambda: model({"a": "Mass", "b": "FreeMass"}, "a.flange b.flange", a={"m": 1.0}, b={"M": -1.0}),
         "these equations are singular for a.m = 1, b.M = -1, though not in general. Change the parameters, or "

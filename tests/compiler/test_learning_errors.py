@@ -21,8 +21,12 @@ from jaxonomy_dae.learning import (
     Shooting,
     Unknown,
 )
-from jaxonomy_dae.learning.training import _facts
+from jaxonomy_dae.learning.evaluation import Evaluation
+from jaxonomy_dae.learning.intervals import checked_level
+from jaxonomy_dae.learning.table import Row, Table
+from jaxonomy_dae.learning.training import _facts, shares_of_time
 from jaxonomy_dae.write import Component, Eq, der
+from jaxonomy_dae.write.interval import POSITIVE
 
 TIMES = np.array([1.0, 2.0, 3.0])
 
@@ -36,7 +40,17 @@ class Tank(Component):
         level = self.variable("level", start=1.0, fixed=True, unit="m")
         outflow = self.variable("outflow")
         (loss,) = self.learned("loss", eqx.nn.MLP(1, 1, 2, 1, jnp.tanh, key=jax.random.key(0)), inputs=[level])
-        self.add_equations(Eq(der(level), u - outflow + loss), Eq(outflow, k * level**2))
+        depth = self.variable("depth")  # the level by another name
+        self.add_equations(Eq(der(level), u - outflow + loss), Eq(outflow, k * level**2), Eq(depth, 2 * level))
+
+
+class Decay(Component):
+    """At a rate above zero."""
+
+    def __init__(self, ev, name="c"):
+        super().__init__(ev, name)
+        x, k = self.variable("x", start=1.0, fixed=True), self.parameter("k", 1.0, bounds=POSITIVE)
+        self.add_equations(Eq(der(x), -k * x))
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +79,7 @@ def record(data=None, **given):
         (dict(sigma=0.0), "sigma of 'tank.level' is a standard deviation > 0"),
         (dict(sigma={"tank.levle": 1.0}), "there are no data of 'tank.levle': did you mean 'tank.level'"),
         (dict(weight=-1.0), "weight is a number ≥ 0; got -1"),
+        (dict(t0="0"), "t0 is the time at which the experiment starts, a number; got '0'"),
     ],
 )
 def test_experiment(given, words):
@@ -81,6 +96,8 @@ def test_experiment(given, words):
         ([record(inputs={"tank.v": 0.0})], {}, "'tank.v' is not an input of this system: did you mean 'tank.u'"),
         ([record(inputs={"tank.u": (TIMES, TIMES)})], {}, "reach from 1 to 3, the experiment from 0 to 3"),
         ([record(inputs={"tank.u": ([0, 5, 4], TIMES)})], {}, "times must increase"),
+        ([record(inputs={"tank.u": np.nan})], {}, "input 'tank.u' must be finite; got nan"),
+        ([record(initial={"tank.level": object()})], {}, "'tank.level' starts at a finite number or Unknown"),
         ([record(inputs={"tank.u": ([0, 2, 4], [0, np.nan, 1])})], {}, r"input 'tank.u': values\[1\] is nan"),
         ([record(), record(inputs={})], {}, "experiment 1 does not give input 'tank.u'"),
         (
@@ -120,6 +137,7 @@ def test_problem(system, experiments, given, words):
         (dict(start={"tank.k": np.nan}), "'tank.k' needs a finite number"),
         (dict(bounds={"tank.k": (2.0, 1.0)}), r"bounds of 'tank.k' must lie within"),
         (dict(horizons=(0.5,)), "horizons are shares"),
+        (dict(steps=-1), "steps is a whole number ≥ 0; got -1"),
         (dict(data=record({"tank.outflow": TIMES})), "name other outputs"),
     ],
 )
@@ -149,14 +167,56 @@ def test_csv_with_missing_cells_and_dates(tmp_path):
         Experiment.from_csv(path, {"room.T": "S"}, time="time")
 
 
+def test_csv_of_other_programs(tmp_path):
+    """Raw errors of Python, a mark at the beginning that became part of a name, and cells that were left out."""
+    path = tmp_path / "record.csv"
+    path.write_text("t,x\n0,1\n1,2\n", encoding="utf-8-sig")
+    np.testing.assert_array_equal(Experiment.from_csv(path, "x", time="t").data["x"], [1.0, 2.0])
+    path.write_text("t,x\n0,1\n1,n/a\n")
+    with pytest.raises(ModelError, match="column 'x' has cells that are no numbers, such as 'n/a'"):
+        Experiment.from_csv(path, ["x"], time="t")
+    path.write_text("t,x\n0,1\n1,2,7\n")
+    with pytest.raises(ModelError, match="row 2 below the first line has more cells"):
+        Experiment.from_csv(path, ["x"], time="t")
+
+
+def test_names_of_new_data_have_no_order(system):
+    """Data in another order, and a constant in place of samples, were said to name other outputs."""
+    both = {"tank.level": TIMES, "tank.outflow": TIMES}
+    given = {"tank.k": Unknown(0.3), "tank.level": 1.0}
+    problem = Problem(system, record(both, initial=given, inputs={"tank.u": ([0, 3], [0, 1])}), train=[])
+    other = record(dict(reversed(both.items())), initial=dict(reversed(given.items())))
+    found = problem._prepared(other, (), None, None)
+    assert found.layout == problem._layout and found.stacked.kinds == (("tank.u", "linear"),)
+
+
+def test_correlations_below_zero_over_whole_steps_alone(system):
+    """A run was blamed whose derivatives were not finite."""
+    even = record(sigma=Noise(0.1, rho=-0.5))
+    Problem(system, even, train=["tank.k"])._prepared(None, (), None, None)
+    uneven = Experiment([1.0, 2.0, 3.0, 4.4], {"tank.level": np.ones(4)}, Noise(0.1, rho=-0.5), {"tank.u": 0.0})
+    with pytest.raises(ModelError, match="'tank.level' are not whole sampling steps apart, .* rho = -0.5"):
+        Problem(system, uneven, train=["tank.k"])._prepared(None, (), None, None)
+
+
+def test_a_probability_and_a_name_of_a_table():
+    """level=95 gave intervals without ends, and a name that is not there a StopIteration."""
+    for level in (95, 0.0, np.nan, "0.95", True):
+        with pytest.raises(ModelError, match="level is a probability between 0 and 1"):
+            checked_level(level)
+    with pytest.raises(ModelError, match="no row 'tank.K' in this table: did you mean 'tank.k'"):
+        Table((Row("tank.k", 1.0, 0.0, 2.0, "", ""),), 0.95)["tank.K"]
+
+
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: Shooting(nodes=0), "nodes is a number of segments ≥ 1; got 0"),
-        (lambda: Shooting(nodes=True), "nodes is a number of segments ≥ 1; got True"),
+        (lambda: Shooting(nodes=0), "nodes is a whole number ≥ 1; got 0"),
+        (lambda: Shooting(nodes=True), "nodes is a whole number ≥ 1; got True"),
         (lambda: GradientSteps(optax.sgd(0.1), -1), "steps is a whole number ≥ 0; got -1"),
         (lambda: GradientSteps(optax.sgd(0.1), 5, batch=0), "batch is a whole number ≥ 1; got 0"),
         (lambda: GradientSteps(optax.sgd(0.1), 5, horizons=(1.0, 0.5)), "the last of them 1"),
+        (lambda: shares_of_time(5), "the last of them 1; got 5"),
         (lambda: Filter({}), "noise is a dictionary by names of states"),
         (lambda: Filter({"tank.level": 0.0}), "noise of 'tank.level' is a number > 0, 'estimate' or Unknown"),
         (lambda: Filter({"tank.level": "guess"}), "noise of 'tank.level' is a number > 0, 'estimate' or .*'guess'"),
@@ -195,6 +255,10 @@ def test_methods_of_a_problem(system):
         (Filter({"tank.level": 0.1, "tank.k": 0.1}), "noise: 'tank.k' is not a variable"),
         (Innovations({("tank.level", "tank.flow"): 0.1}), "there are no data of 'tank.flow'"),
         (Innovations({("tank.outflow", "tank.level"): 0.1}), "'tank.outflow' is not a differential state"),
+        (
+            Innovations({("tank.level", "tank.level"): 0.1, ("tank.depth", "tank.level"): 0.2}),
+            "gain of tank.depth by tank.level is given twice, also as the gain of tank.level by tank.level",
+        ),
     ],
 )
 def test_names_of_errors_in_equations(system, method, words):
@@ -259,3 +323,14 @@ def test_priors_outside_of_bounds(system):
     problem = Problem(system, data, train=[])
     with pytest.raises(ModelError, match=r"tank.k, experiment 0: the guess must lie in \[0, inf\].*; got -1"):
         problem.fit()
+
+
+def test_the_prior_of_a_positive_number_of_an_experiment_is_normal():
+    """It was log-normal: two standard deviations below a guess of 1 ± 2 lay 0.02, and above 50."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(Decay(ev))
+    data = Experiment(TIMES, {"c.x": TIMES}, initial={"c.k": Unknown(1.0, spread=2.0)})
+    objective = Problem(AcausalCompiler(ev, diagram)(), data)._prepared(None, (), None, None)
+    z = objective.coordinates.scaled(np.array([4.0]))
+    found = Evaluation(np.zeros(3), np.zeros((3, 1)))
+    assert objective.weights(z, found).prior(z).residual == pytest.approx([(4.0 - 1.0) / 2.0], rel=1e-12)

@@ -503,6 +503,59 @@ def test_the_value_before_the_start_of_what_is_not_kept_is_nothing():
     assert "x" in built(text).variables
 
 
+def test_the_value_before_of_what_may_jump_is_refused():
+    """y = 3·d jumps with d, and pre(y) was y itself, 15 instead of 0 here; a state is what it was."""
+    text = """model m Real d(start = 0); Real e(start = 0); Real x(start = 0); Real y; equation der(x) = 1; y = 3 * d;
+      when x > 1 then d = 5; e = pre({}); end when; end m;"""
+    with pytest.raises(ModelError, match=r"pre\(y\): 'y' is neither discrete nor a state"):
+        built(text.format("y"))
+    assert "e" in built(text.format("x")).parameters and "e" in built(text.format("d")).parameters
+
+
+def settled(text: str, times) -> list[dict[str, float]]:
+    """The discrete variables of a model after each of these instants, by carrying out its declared events one by one:
+    those that others wait for come first. What they read and write is evaluated by SymPy."""
+    component = built(text)
+    definitions = {}
+    for e in component.equations:
+        heads = [s for s in sympy.Add.make_args(e) if str(s).startswith(":when")]
+        for head in sorted(heads, key=str)[-1:]:  # `:when[3]` after `:when:pending`, which it reads
+            definitions[head] = head - e
+    q = {name: p.value for name, p in component.parameters.items() if p.is_discrete}
+
+    def value(e, t):
+        known = {s: definitions[s] for s in e.free_symbols if s in definitions}
+        if known:
+            return value(e.xreplace({s: value(d, t) for s, d in known.items()}), t)
+        numbers = {s: t if str(s) == "time" else 2 if "relation" in str(s) else q[s.path] for s in e.free_symbols}
+        return sympy.sympify(e.xreplace(numbers))
+
+    out = []
+    for t in times:
+        for turn in range(60):
+            due = [k for k in component.events if k.guard is not None and value(VariableSymbol(k.guard), t) <= 0]
+            if not due:
+                break
+            assert turn < 50, "the iteration has no end"
+            now = min(due, key=lambda k: EventFlag.LAST in k.flags)
+            written = [v if isinstance(v, float) else value(VariableSymbol(v), t) for v in now.values]
+            q.update((a.target.path, v) for a, v in zip(now.actions, written, strict=True))
+        out.append({name: float(v) for name, v in q.items()})
+    return out
+
+
+def test_whens_act_once_in_order_and_again_until_nothing_changes():
+    """An edge is one iteration long; of a `when` and its `elsewhen` that rise together the first acts; `pre` follows;
+    and what reads `pre` of what has changed is looked at again."""
+    text = """model m Integer n(start = 0); Integer k(start = 0); Integer j(start = 0); Boolean a(start = false);
+      Boolean b(start = false); Boolean c(start = false); Real x; equation x = n + k + j;
+      when {time > 1, time > 2} then n = pre(n) + 1; elsewhen time > 1 then k = pre(k) + 1; n = 7; end when;
+      a = time > 2; b = pre(a); c = pre(b);
+      when c then j = pre(j) + 1; end when; end m;"""
+    found = [[values[n] for n in "nkj"] for values in settled(text, [0.5, 1.5, 1.7, 2.5, 3.0])]
+    assert found == [[0, 0, 0], [1, 0, 0], [1, 0, 0], [2, 0, 1], [2, 0, 1]]
+
+
 def values_of(text: str) -> dict[str, str]:
     """What the discrete variables of a model become where their `when` acts, by name; `new(n)` is what n becomes."""
     found = {}

@@ -78,6 +78,10 @@ def test_thermal(make, message):
         (lambda ev: sig.Table2D(ev, "t", [0, 1], [0, 1], [[1, 2]]), r"'t': values has shape \(1, 2\)"),
         (lambda ev: sig.TransferFunction(ev, "f", [1, 0], [2]), r"'f': the numerator's degree, 1, is above"),
         (lambda ev: sig.StateSpace(ev, "s", [[1, 0]], [[1]], [[1]]), r"'s': A has shape \(1, 2\)"),
+        (
+            lambda ev: sig.StateSpace(ev, "s", np.eye(2), [0, 1], [1, 0]),
+            r"B has shape \(1, 2\), expected \(2, 1\): one",
+        ),
         (lambda ev: sig.TransferFunction(ev, "f", [[1, 0]], [2, 1]), r"'f': numerator is one row.*shape \(1, 2\)"),
         (lambda ev: sig.DiscreteTransferFunction(ev, "f", [1], [[2, 1]]), r"'f': denominator is one row"),
         (lambda ev: sig.Hysteresis(ev, "h", initially_on="no"), "'h': initially_on is True or False; got 'no'"),

@@ -55,6 +55,15 @@ def test_what_is_admitted():
     assert Ends.of([Interval(0.1, 0.3)]).admit(np.array([0.3], np.float32)).all()
 
 
+def test_an_end_at_infinity_is_no_bound_however_it_is_written():
+    """(−∞, ∞) and (−∞, 0.5]: what is written as an open end at infinity leaves nothing out."""
+    z = jnp.array([-3.0, 2.0])
+    everything, below = Interval(-np.inf, np.inf, True, True), Interval(-np.inf, 0.5, open_low=True)
+    assert everything == Interval()
+    np.testing.assert_allclose(constrained(z, Ends.of([everything] * 2)), z)
+    np.testing.assert_allclose(constrained(z, Ends.of([below] * 2)), 0.5 - np.exp(-np.asarray(z)))
+
+
 def test_of_systems():
     """Parameters and the weights of a network in one dictionary, which changes nothing when it is put back."""
 

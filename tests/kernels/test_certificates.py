@@ -117,6 +117,9 @@ def test_passivity_needs_to_know_the_inputs():
         assert_passive(lambda v: -v, 2, inputs=[1.0])
     with pytest.raises(ModelError, match="size is a whole number"):
         assert_passive(lambda v: -v, 0)
+    for given in ({"weights": -1}, {"count": 0}):  # an active law passed: no set of weights was looked at
+        with pytest.raises(ModelError, match="is a whole number"):
+            assert_passive(lambda v: v, 1, **given)
     plain = eqx.nn.MLP(2, 2, 8, 2, jnp.tanh, key=jax.random.key(0))
     with pytest.raises(AssertionError):
         assert_passive(plain, 2)

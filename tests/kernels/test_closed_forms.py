@@ -155,7 +155,7 @@ def test_numbers_inside_that_do_not_fit(make, words):
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: powers(0), r"powers\(highest\) takes a whole number ≥ 1; got 0"),
+        (lambda: powers(0), r"powers: highest is a whole number ≥ 1; got 0"),
         (lambda: terms(), "at least one expression or function"),
         (lambda: terms(drag=3.0), "'drag' needs a function of the block's inputs, or a range .* got 3.0"),
         (lambda: terms(None), "takes SymPy expressions, texts, or functions by name.*got None"),

@@ -1,7 +1,9 @@
 """Coordinates of a search: natural values and derivatives on their scale."""
 
 import numpy as np
+import pytest
 
+from jaxonomy_dae import ModelError
 from jaxonomy_dae.learning.coordinates import Coordinates, Shifts
 
 
@@ -22,3 +24,18 @@ def test_biases_are_measured_at_the_centre_of_inputs():
     np.testing.assert_allclose(c.moved(z, np.eye(3)), steps, atol=1e-12)
     np.testing.assert_allclose(c.pulled(z, rows), rows @ steps, atol=1e-11)
     np.testing.assert_allclose(c.pulled(z, rows[0]), rows[0] @ steps, atol=1e-11)
+
+
+def test_an_open_end_can_be_named():
+    """Bounds (0, 10) of what is declared above zero: "must lie within [0, inf]; got [0, 10]"."""
+    high, flags = np.array([np.inf, np.nextafter(2.0, 0.0)]), np.zeros(2, bool)
+    low = np.nextafter([0.0, 1.0], np.inf)
+    c = Coordinates(
+        ("k", "q"), ("",) * 2, ("k", "q"), flags, ~flags, np.ones(2), np.full(2, 1.5), low, high, np.full(2, np.inf),
+        np.zeros(2), flags, n_shared=2, n_own=0, experiments=1,
+    )  # fmt: skip
+    found = c.bounded({"k": (0, 10), "q": (1.0, 2.0)})
+    np.testing.assert_array_equal(found.low, low)
+    np.testing.assert_array_equal(found.high, [10.0, high[1]])
+    with pytest.raises(ModelError, match="must lie within those declared"):
+        c.bounded({"q": (0.999, 2.0)})

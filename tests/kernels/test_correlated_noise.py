@@ -1,6 +1,8 @@
 """Noise of first order, tails of residuals and splines of inputs beside SciPy: no model is compiled."""
 
 import warnings
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,8 @@ from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.learning import Noise, powers
 from jaxonomy_dae.learning.colour import Colour
 from jaxonomy_dae.learning.data import Stacked
+from jaxonomy_dae.learning.discovery import criterion
+from jaxonomy_dae.learning.evaluation import Weights
 from jaxonomy_dae.learning.outliers import heavy_tails, outliers
 from jaxonomy_dae.run.system.splines import natural_spline
 
@@ -95,3 +99,21 @@ def test_splines_of_inputs_are_natural(n):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         np.testing.assert_allclose(forward @ y, exact, atol=1e-12)  # a curve is linear in its samples
+
+
+def test_criteria_count_the_density_of_correlated_noise():
+    """BIC = −2 ln L + k ln n, less n ln 2π, beside SciPy: without the density's own factor, closed forms whose noise
+    correlates differently could not be compared."""
+    rng, n, sigma = np.random.default_rng(0), 30, 0.3
+    data, errors = stacked(0.1 * np.arange(n), [sigma, 2.0]), rng.standard_normal(n)
+    rows = (np.zeros(n, int), np.arange(n), np.zeros(n, int))
+    for rho in (0.0, 0.8):
+        colour = Colour.of(data, rows, np.array([rho, 0.0]))
+        weights = Weights(np.full(n, 1 / sigma), np.zeros(0), np.zeros(0), np.ones(n))
+        cost = weights.cost(np.zeros(0), colour.whitened(errors))
+        fitted: Any = SimpleNamespace(
+            minimum=SimpleNamespace(cost=cost, weights=weights), objective=SimpleNamespace(colour=colour)
+        )
+        covariance = sigma**2 * rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+        exact = -2 * scipy.stats.multivariate_normal.logpdf(errors, cov=covariance) + 3 * np.log(n)
+        assert criterion(fitted, 3) == pytest.approx(exact - n * np.log(2 * np.pi), rel=1e-12)

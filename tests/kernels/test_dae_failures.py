@@ -16,7 +16,7 @@ from jaxonomy_dae import InitializationError, ModelError, SimulationError
 from jaxonomy_dae.solve.methods.dae_term import FlatProblem
 from jaxonomy_dae.solve.methods.failures import explain_start, how_it_stopped, start_check
 from jaxonomy_dae.solve.methods.solve import _on_constraints
-from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, consistent_start, solve_dae
+from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, StepControl, consistent_start, solve_dae
 
 ONE, NONE = np.ones(1), np.zeros(1)
 NAMES = ("a.x", "a.z")
@@ -260,6 +260,15 @@ BAD = {
     ),
     "names": (lambda: solve_dae(TERM, 1.0, GOOD, names=["p"]), "names must name every unknown: 3 of them; got 1"),
     "negative rtol": (lambda: solve_dae(TERM, 1.0, GOOD, rtol=-1.0), "rtol must be a number ≥ 0; got -1.0"),
+    "rtol of each": (
+        lambda: solve_dae(TERM, 1.0, GOOD, rtol=np.array([0.1, 0.1])),
+        "rtol must be one number; got [0.1 0.1]. Where unknowns differ, give atol in the shape of y",
+    ),
+    "longest step beside a controller": (
+        lambda: solve_dae(TERM, 1.0, GOOD, dtmax=0.1, stepsize_controller=StepControl(1e-3, 1e-3)),
+        "dtmax and stepsize_controller both say how long steps are: leave one out, or put dtmax into the controller "
+        "(StepControl(..., dtmax=...), diffrax.ClipStepSizeController(..., jump_ts=...))",
+    ),
     "atol": (
         lambda: solve_dae(TERM, 1.0, GOOD, atol=np.ones(2)),
         "atol must be one number or look like y: expected shapes [(1,), (2,)], found [(2,)]",
@@ -359,3 +368,10 @@ def test_a_regular_mass_matrix_is_an_ordinary_equation(solver):
 def test_a_mass_matrix_that_is_a_function():
     with pytest.raises(ModelError, match="is constant; got a function. Where M varies, make the slopes z unknowns"):
         DAETerm(lambda t, y, args: y, mass=lambda t, y: jnp.eye(2))
+
+
+def test_a_mass_matrix_stays_the_users():
+    for mine in (np.ones(2), np.array([[1.0, 2.0], [0.0, 1.0]])):
+        term = DAETerm(minus, mass=mine)
+        mine[:] = 3.0
+        assert not (term.mass.array == 3.0).any()

@@ -12,6 +12,7 @@ from affine_events import CLOCKS, EVENTS, GUARDS, MAX_EVENTS, STATES, Affine, Ev
 from jaxonomy_dae import ModelError
 from jaxonomy_dae.solve.events.event_map import handle
 from jaxonomy_dae.solve.events.instant import Arrival
+from jaxonomy_dae.solve.events.iteration import Iteration
 from jaxonomy_dae.solve.events.search import first_crossing
 from jaxonomy_dae.solve.events.start import start
 
@@ -144,6 +145,37 @@ def test_a_guard_may_meet_zero_flatly(power):
     jax.effects_barrier()
     np.testing.assert_allclose(found, 0.3, rtol=0, atol=2e-13)
     assert len(looks) - 2 <= (10 if power == 1 else 46)
+
+
+def test_an_iteration_that_comes_to_values_again_goes_round_in_a_circle():
+    """Whatever leads to the circle, and however long it is: Brent's method needs no more than three times as many
+    turns as there are different values. What moves on for ever, or starts states anew, is no circle."""
+
+    @functools.partial(jax.jit, static_argnums=2)
+    def iterated(values, follows, moved):
+        def turn(iteration, _):
+            state, found = iteration
+            state = follows[state]
+            return (state, found.after(values[state], jnp.array(moved))), found.count
+
+        begin = jnp.array(0), Iteration.begin(values.shape[1], values.dtype)
+        (_, last), counts = jax.lax.scan(turn, begin, length=3 * len(values) + 3)
+        return last.count, last.turning, counts
+
+    n, rng = 12, np.random.default_rng(0)
+    for _ in range(20):
+        tail, circle = rng.integers(0, 6), rng.integers(1, 6)
+        follows = np.append(np.arange(1, n), 0)
+        follows[tail + circle - 1] = tail
+        values = rng.integers(0, 3, (n, 4)).astype(float)
+        values[:, 0] = np.arange(n)  # all states differ
+        count, turning, _ = iterated(values, follows, False)
+        assert 0 < -float(count) <= 3 * (tail + circle) + 1
+        round_it = values[tail : tail + circle]
+        np.testing.assert_array_equal(turning > 0, (round_it != round_it[0]).any(axis=0))
+        assert float(iterated(values, follows, True)[0]) > 0
+    values = np.arange(60.0)[:, None]
+    assert iterated(values, np.minimum(np.arange(1, 61), 59), False)[2][50] == 50
 
 
 def test_a_search_that_is_not_wanted_costs_nothing():

@@ -12,6 +12,7 @@ import sympy
 from test_functions import compiled
 
 from jaxonomy_dae import der
+from jaxonomy_dae.graph.expressions.branches import union
 from jaxonomy_dae.graph.expressions.differentiate import directional_derivative, partial_derivative
 from jaxonomy_dae.graph.expressions.from_sympy import read
 from jaxonomy_dae.graph.expressions.functions import TABLE
@@ -305,3 +306,18 @@ def test_functions_in_a_constraint_differentiated_twice():
     assert abs(value) < 1e-10
     assert abs(rate) < 1e-10
     assert abs(second) < 1e-9
+
+
+def test_what_is_zero_divides_where_its_branch_is_taken_only():
+    """An unknown that is identically zero is the number 0.0 of a program."""
+    kernel = Kernel([graph(X * sympy.Piecewise((1 / Y, Y > 0), (2, True))), graph(1 / Y)], ["x", "y"])
+    value, slope = jax.value_and_grad(lambda x: kernel([x, 0.0])[0])(3.0)
+    assert (value, slope) == (6.0, 2.0)
+    assert kernel([3.0, 0.0])[1] == np.inf
+
+
+def test_where_a_node_is_needed_does_not_depend_on_an_order():
+    """Of c ∧ d, c ∧ ¬d and ¬c ∧ ¬d, the second makes c with the first and ¬d with the last."""
+    (c, no_c), (d, no_d) = ([(name, holds) for holds in (True, False)] for name in "cd")
+    first = frozenset([frozenset([c, d]), frozenset([no_c, no_d])])
+    assert union(first, frozenset([frozenset([c, no_d])])) == frozenset([frozenset([c]), frozenset([no_d])])

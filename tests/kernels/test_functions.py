@@ -9,6 +9,7 @@ import pytest
 import sympy
 from function_table import FUNCTIONS
 from problems import run
+from sympy.codegen.cfunctions import hypot
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
 from jaxonomy_dae.graph.expressions.from_sympy import read
@@ -239,6 +240,48 @@ def test_an_arccotangent_has_a_slope_at_zero_and_large_binomials_a_value():
         value, slope = jax.value_and_grad(lambda v: kernel([0.0, v])[1])(count)
         np.testing.assert_allclose(value, count * (count - 1) * (count - 2) / 6, rtol=1e-12)
         np.testing.assert_allclose(slope, (3 * count**2 - 6 * count + 2) / 6, rtol=1e-11)
+
+
+def test_slopes_that_jax_has_otherwise():
+    """The first and second derivative of a kernel in JAX, against 30 digits."""
+    x = sympy.Symbol("x", real=True)
+    cases = {
+        sympy.besseli(0, x): (0.0, 0.5),
+        sympy.besseli(1, x): (0.0, 1e-9, 3.0),
+        sympy.gamma(x): (-10.25, 2.5),
+        sympy.digamma(x): (-10.25, 2.5),
+        sympy.polygamma(2, x): (-10.25, 2.5),
+    }
+    kernels = [Kernel([read(f, str)], ["x"]) for f in cases]
+
+    def at(kernel, point):
+        value = lambda v: kernel([v])[0]  # noqa: E731
+        return jax.jvp(lambda v: jax.jvp(value, (v,), (1.0,)), (point,), (1.0,))
+
+    found = jax.jit(lambda: [[at(k, p) for p in points] for k, points in zip(kernels, cases.values(), strict=True)])()
+    for (f, points), here in zip(cases.items(), found, strict=True):
+        reference = sympy.lambdify(x, f, "mpmath")
+        for point, ((value, slope), (_, curve)) in zip(points, here, strict=True):
+            with mp.workdps(30):
+                expected = [mp.diff(reference, mp.mpf(point), n) for n in range(3)]
+            np.testing.assert_allclose([value, slope, curve], np.array(expected, float), rtol=1e-12, atol=1e-15)
+
+
+def test_what_is_not_a_number_stays_so():
+    x, y = sympy.symbols("x y")
+    for f in (hypot(x, y), sympy.Heaviside(x)):
+        kernel = Kernel([read(f, str)], ["x", "y"])
+        assert np.isnan(kernel([np.nan, 2.0], "numpy")[0]) and np.isnan(kernel([jnp.nan, 2.0])[0])
+
+
+def test_a_step_far_from_where_its_exponential_overflows():
+    """exp(40x)/(1 + exp(40x − 800)), which is exp(40x) for x < 19 and exp(800) beyond, with a slope."""
+    x = sympy.Symbol("x", real=True)
+    kernel = Kernel([read(sympy.exp(40 * x) / (1 + sympy.exp(40 * x - 800)), str)], ["x"])
+    at = np.array([-1.0, 0.0, 3.0, 17.0])
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(lambda v: kernel([v])[0])))(at)
+    np.testing.assert_allclose(values, np.exp(40 * at), rtol=1e-12)
+    np.testing.assert_allclose(slopes, 40 * np.exp(40 * at), rtol=1e-12)
 
 
 def test_a_negative_base_is_not_a_number():

@@ -116,6 +116,8 @@ def test_a_type_that_nobody_thought_of_is_refused():
     assert Identity.of(one) == Identity.of(Record({"a": [np.arange(3), 1]}))
     assert Identity.of(["ab", "c"]) != Identity.of(["a", "bc"]) != Identity.of(("a", "bc"))
     assert Identity.of([rising]) != Identity.of([falling]) and Identity.of([rising, 1]) == Identity.of([rising, 1])
+    # A number and a vector of one number are two things.
+    assert Identity.of(np.array(1.0)) != Identity.of(np.array([1.0]))
 
 
 def test_identity_survives_a_file():

@@ -5,7 +5,7 @@ import numpy as np
 import planar_models
 import pytest
 from problems import RELEASE, compiled
-from sympy import Eq
+from sympy import Eq, acos, sqrt
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, der
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
@@ -214,6 +214,24 @@ def test_an_alias_may_be_given_with_its_sign(given):
 def test_underdetermined_starts_keep_the_guesses(declared):
     """A capacitor without a given voltage starts at its guess, 0; one that a source determines starts there."""
     np.testing.assert_allclose(declared("charged.free.v", "charged.tied.v", "charged.r.i"), [0.0, 3.0, 3.0], atol=1e-12)
+
+
+def test_a_start_whose_slope_is_infinite():
+    """√(2gh) at h = 0 and acos(c) at c = 1 are numbers, though rounding of h and c cannot be told by their slopes."""
+
+    class Dropped(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            h, c = self.parameter("h", 0.0), self.parameter("c", 1.0)
+            v = self.variable("v", start=sqrt(2 * 9.81 * h), fixed=True)
+            a = self.variable("a", start=acos(c), fixed=True)
+            self.add_equations(Eq(der(v), -v), Eq(der(a), v))
+
+    system = compiled(Dropped(EqnEnv(), "m"))
+    order = [system.states.index(name) for name in ("m.v", "m.a")]
+    np.testing.assert_array_equal(np.asarray(system.initialize())[order], [0.0, 0.0])
+    moved = system.with_parameters({"m.h": 0.5, "m.c": 0.0})
+    np.testing.assert_allclose(np.asarray(moved.initialize())[order], [np.sqrt(9.81), np.pi / 2], rtol=1e-15)
 
 
 def test_inputs_and_time_enter():

@@ -1,5 +1,7 @@
 """Parameters that are expressions in others: set, trained and differentiated through what they depend on."""
 
+from typing import Any, NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 from problems import compiled
-from sympy import Eq, sqrt
+from sympy import Eq, ImmutableMatrix, Matrix, sqrt
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
 from jaxonomy_dae.learning import minimize
@@ -156,6 +158,34 @@ def test_equal_names_in_parent_and_child_are_two_parameters():
     expected = {"p.a": 5.0, "p.k": 9.0, "p.c.a": 9.0, "p.c.k": 5.0, "p.c.b": 45.0, "p.c.root": 9.0 * 5.0**0.5}
     assert found == pytest.approx(expected)
     np.testing.assert_allclose(system.initialize(), [9.0])
+
+
+class Named(NamedTuple):
+    first: Any
+
+
+@pytest.mark.parametrize(
+    "hold",
+    [lambda s: [s], lambda s: np.array([s]), lambda s: np.array([[s]]).ravel(), Matrix, ImmutableMatrix, Named],
+)
+def test_containers_of_the_parents_symbols(hold):
+    """In whatever a symbol is handed down, it is the parent's, though the child has one of its name."""
+
+    class Child(Component):
+        def __init__(self, ev, name, given):
+            super().__init__(ev, name)
+            R = self.parameter("R", 7.0)
+            self.parameter("seen", given[0] - R)
+
+    class Parent(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x = self.variable("x", start=0.0, fixed=True)
+            self.add_equations(Eq(der(x), 1))
+            R = self.parameter("R", 3.0)
+            self.add(Child(ev, "c", hold([R]) if hold in (Matrix, ImmutableMatrix) else hold(R)))
+
+    assert compiled(Parent(EqnEnv(), "p")).parameters["p.c.seen"] == 3.0 - 7.0
 
 
 def test_an_argument_may_stand_in_equations_as_it_is():

@@ -150,3 +150,11 @@ def test_entries_of_which_nothing_is_known():
 
 def test_more_rows_than_columns():
     assert not rank_of(np.ones((3, 2)), np.zeros((3, 2))).is_regular
+
+
+def test_a_verdict_draws_no_random_numbers_of_the_user():
+    n = 400
+    matrix = sp.diags_array([np.full(n - 1, -1.0), np.full(n, 2.5), np.full(n - 1, -1.0)], offsets=[-1, 0, 1]).tocsr()
+    before = np.random.get_state()[1].copy()
+    assert sparse_rank_of(matrix, EPS * abs(matrix)).is_regular
+    assert np.array_equal(before, np.random.get_state()[1])

@@ -1,13 +1,17 @@
 """Parts of records and coarser ones, beside closed forms and SciPy."""
 
+from typing import Any
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
 
 from jaxonomy_dae.errors import ModelError
-from jaxonomy_dae.learning import Experiment, Unknown
+from jaxonomy_dae.learning import Experiment, Filter, Noise, Unknown
 
 TS = np.linspace(0.0, 10.0, 401)
+AT = np.array([1.0, 2.0, 3.0])
 
 
 def record(**given):
@@ -81,3 +85,41 @@ def test_a_trend_is_taken_away():
         record().detrend("c.z")
     with pytest.raises(ModelError, match="1 samples, too few"):
         Experiment(TS[:2], {"c.x": [1.0, np.nan]}).detrend()
+
+
+def test_what_is_known_somewhere_else_is_said_anew():
+    """A prior of the value at t0 became one of the value at a window's start."""
+    with pytest.raises(ModelError, match="'c.x' is known at 0, not at 2"):
+        record(initial={"c.x": Unknown(0.0, spread=0.1)}).window(2.0, 5.0)
+
+
+def test_correlations_are_those_of_neighbours():
+    """Of noise that correlates by 0.9 from sample to sample, every tenth sample does by 0.9¹⁰ = 0.35."""
+    coloured = record(sigma={"c.x": Noise(0.1, rho=0.9)})
+    for coarser in (lambda: coloured.decimate(10), lambda: coloured.resample(TS[::10])):
+        with pytest.raises(ModelError, match="the noise of 'c.x' is correlated, rho, from one sample to the next"):
+            coarser()
+    with pytest.raises(ModelError, match="is correlated"):  # how much quieter it becomes is not known
+        record(sigma={"c.x": Noise(0.1, rho="estimate")}).decimate(10)
+    assert record(sigma={"c.x": Noise(rho="estimate")}).decimate(10).noise("c.x").rho == "estimate"
+
+
+def test_numbers_of_numpy_and_jax_are_numbers():
+    """Those of JAX were refused, with words that were not true; a start known so was kept at a window's start."""
+
+    def number(x: float) -> Any:
+        return jnp.asarray(np.array(x))
+
+    levels, count = jnp.asarray(0.1 + 0.01 * AT), np.int64(2)
+
+    def given(**others: Any) -> Experiment:
+        return Experiment(AT, {"c.x": AT}, **others)
+
+    known = {"c.x": number(2.0), "c.k": np.array(0.3)}
+    one = given(t0=number(1.0), weight=np.array(2.0), initial=known)
+    assert (one.t0, one.weight, one.initial) == (1.0, 2.0, {"c.x": 2.0, "c.k": 0.3})
+    np.testing.assert_array_equal(given(sigma=levels).sigma["c.x"], np.asarray(levels))
+    assert given(sigma=number(0.1)).sigma["c.x"] == 0.1 and Unknown(number(2.0)) == Unknown(2.0)
+    with pytest.raises(ModelError, match="'c.x' is known at 1, not at 2"):
+        one.window(2.0, 3.0)
+    assert Filter({"c.x": 1.0}, count) == Filter({"c.x": 1.0}, 2)

@@ -75,15 +75,17 @@ def test_jacobian_is_the_dense_one():
         return jnp.sin(pattern.multiply(jnp.asarray(values), y)) + y**3
 
     single = pattern.coalesced[0]
-    found = sparse_jacobian(fun, single)
+    found, repeated = sparse_jacobian(fun, single), sparse_jacobian(fun, pattern)
     assert pattern.n_colors < 20  # of 40 columns
 
     @jax.jit
     def with_derivatives(b):
         """Both Jacobians, and their derivatives: second derivatives along a direction."""
-        return [jax.jvp(f, (b,), (b,)) for f in (lambda y: single.dense(found(y)), jax.jacfwd(fun))]
+        functions = lambda y: single.dense(found(y)), jax.jacfwd(fun)
+        return [jax.jvp(f, (b,), (b,)) for f in functions], pattern.dense(repeated(b))
 
-    (values, second), (expected, expected_second) = with_derivatives(b)
+    ((values, second), (expected, expected_second)), added = with_derivatives(b)
+    np.testing.assert_allclose(added, values, rtol=1e-15)  # values at one place add up
     np.testing.assert_allclose(values, expected, rtol=1e-14, atol=1e-14)
     np.testing.assert_allclose(second, expected_second, rtol=1e-13, atol=1e-13)
 

@@ -427,6 +427,21 @@ def test_a_point_of_another_pendulum():
     np.testing.assert_allclose(np.sort(poles.imag), np.sqrt(9.81 / 4) * np.array([-1, 1]), rtol=1e-9)
 
 
+def test_one_of_many_equilibria():
+    """Two bodies that radiate to each other rest at any common temperature T, with the pole −4·sigma·T³·(1/C1 + 1/C2):
+    a linear model that a search chose was that of 322 K for bodies that end at 375 K."""
+    ev = EqnEnv()
+    a, b = th.HeatCapacitor(ev, "a", 100.0, 300.0), th.HeatCapacitor(ev, "b", 300.0, 400.0)
+    gap = th.Radiation(ev, "gap", eps=1.0)
+    system = compiled(a, b, gap, connect=[(a.heat, gap.port_a), (b.heat, gap.port_b)])
+    with pytest.raises(SteadyStateError, match=r"one of many: .*a common change of a\.T, b\.T.*drifting=\['a\.T'\]"):
+        linearize(system, [], ["gap.Q_flow"])
+    at = steady_state(system.with_parameters({"a.initial_temperature": 375.0}), drifting=["a.T"])
+    poles = linearize(system, [], ["gap.Q_flow"], at=at).poles()
+    expected = [0.0, -4 * th.STEFAN_BOLTZMANN * 375.0**3 * (1 / 100 + 1 / 300)]
+    np.testing.assert_allclose(poles, expected, rtol=1e-9, atol=1e-15)
+
+
 @pytest.mark.slow
 def test_to_control():
     space = linearize(motor(), {"source.u": 0.0}, ["motor.rotor.w"])

@@ -1,53 +1,20 @@
 """Closed mechanisms that strike, stick and are switched. References: SciPy's solution in one coordinate, from event to
 event."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.integrate
+from from_event_to_event import compare, followed
 from problems import compiled
 from sympy import cos, sin, sqrt
 
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.signal as sig
 import jaxonomy_dae.library.translational as line
-from jaxonomy_dae import Component, Eq, EqnEnv, Rotational, Translational, simulate
+from jaxonomy_dae import Component, Eq, EqnEnv, Rotational, Translational
 from jaxonomy_dae.library.contacts import HardStop
 from jaxonomy_dae.library.friction import Brake
 
-TIGHT = dict(rtol=1e-10, atol=1e-10)
 ROD = 0.25
-
-
-def followed(slopes, y, begin, end, meets=None):
-    """The state at the end, or where `meets` falls through zero, and the time."""
-    if meets is not None:
-        meets.terminal, meets.direction = True, -1
-    run = scipy.integrate.solve_ivp(
-        slopes, (begin, end), y, events=meets, method="DOP853", rtol=1e-12, atol=1e-13, max_step=(end - begin) / 50
-    )
-    return run.t[-1], run.y[:, -1]
-
-
-def differences(f, p, part=1e-3):
-    """The derivatives of f by the entries of p, by differences of fourth order."""
-    steps = np.diag(part * np.abs(p))
-    return np.array([(8 * (f(p + d) - f(p - d)) - (f(p + 2 * d) - f(p - 2 * d))) / (12 * d.sum()) for d in steps])
-
-
-def compare(system, names, values, read, known, end, inputs=None):
-    """The variable `read` at the end and its derivatives by the parameters, against the function `known` of these."""
-
-    def last(p):
-        given = system.with_parameters(dict(zip(names, p, strict=True)))
-        return simulate(given, end, ts=jnp.array([end]), inputs=inputs, **TIGHT)[read][-1]
-
-    value, slopes = jax.value_and_grad(last)(jnp.array(values))
-    p = np.array(values)
-    np.testing.assert_allclose(value, known(p), rtol=1e-9)
-    expected = differences(known, p)
-    np.testing.assert_allclose(slopes * p, expected * p, rtol=0, atol=1e-7 * np.max(np.abs(expected * p)))
 
 
 class Yoke(Component):

@@ -307,3 +307,70 @@ def test_the_log_of_a_run_that_ends_and_of_one_without_events():
     assert found.events.terminated == "the end"
     (value, found), slope = run(0.5, 9.0)
     assert not len(found.events) and found.events.terminated is None and value == slope == 0
+
+
+@pytest.mark.slow
+def test_strict_relations_beside_others():
+    """At t = 1/2 an event sets y from 1 onto 0, where it rests, beside x = 1 and z = 0. `Or(x < 0, y <= 0)` becomes
+    true, and was missed: a guard knew only whether one of its relations is strict. A ball at 1 − t² bounces as ever."""
+
+    def write(self, ev):
+        y, x, z = (self.variable(k, start=s, fixed=True) for k, s in (("y", 1.0), ("x", 1.0), ("z", 0.0)))
+        h, v = self.variable("h", start=1.0, fixed=True), self.variable("v", start=0.0, fixed=True)
+        self.add_equations(*(Eq(der(k), 0) for k in (x, y, z)), Eq(der(h), v), Eq(der(v), -2))
+        self.when(ev.t >= 0.5, reinit(y, 0.0))
+        conditions = (
+            Or(x < 0, y <= 0), Or(x <= 0, y < 0), And(x > 0, y <= 0), And(x >= 0, y < 0), Or(z < 0, y <= -1),
+            sympy.Not(And(x >= 0, y > 0)),
+        )  # fmt: skip
+        for k, condition in enumerate(conditions):
+            n = self.discrete(f"n{k}")
+            self.when(condition, assign(n, pre(n) + 1))
+        bounces = self.discrete("bounces")
+        self.when(And(h <= 0, v < 0), reinit(v, -v / 2), assign(bounces, pre(bounces) + 1))
+
+    run = simulate(compiled(component(write)), 2.25, ts=jnp.array([2.25]), **TIGHT)
+    assert [int(run[f"c.n{k}"][0]) for k in range(6)] == [1, 0, 1, 0, 0, 1]
+    assert int(run["c.bounces"][0]) == 2  # h = 1 − t², then t' − t'² with t' = t − 1
+    assert float(run["c.h"][0]) == pytest.approx(0.125 - 0.25**2, abs=1e-8)
+
+
+@pytest.mark.slow
+def test_guards_that_meet_zero_flatly():
+    """h falls by one a second from h0: each of these guards is zero where h is, at t = h0. Steps are not used up."""
+
+    def write(self, ev):
+        h = self.variable("h", start=self.parameter("h0", 1.0), fixed=True)
+        self.add_equations(Eq(der(h), -1))
+        forms = h**3, (h / 10) ** 3, h**3 + 1e-9 * h, h**5, h * Abs(h), sympy.tanh(h) ** 3, 1e-9 * h, 1e9 * h
+        for k, form in enumerate(forms):
+            self.when(form <= 0, assign(self.discrete(f"at{k}"), ev.t))
+
+    system = compiled(component(write))
+    names = [f"c.at{k}" for k in range(8)]
+
+    def times(h0):
+        of = system.with_parameters({"c.h0": h0})
+        return simulate(of, 2.0, ts=jnp.array([2.0]), max_steps=300, **TIGHT)[names][0]
+
+    np.testing.assert_allclose(times(1.0), 1.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(times))(1.0), 1.0, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_condition_whose_sides_the_equations_keep_equal_is_named():
+    """s = a + b: `s - a - b <= 0` was silently never true. Beside it, a level that a does not reach, and a value that
+    rests on its level, but need not."""
+
+    def write(self, ev):
+        a, b = self.variable("a", start=1.0, fixed=True), self.variable("b", start=2.0, fixed=True)
+        s, rests = self.variable("s"), self.variable("rests", start=0.0, fixed=True)
+        d, n = self.discrete("d"), self.discrete("n")
+        self.add_equations(Eq(der(a), -1), Eq(der(b), -2), Eq(der(rests), 0), Eq(s, a + b))
+        for condition in (s - a - b <= 0, a >= 5, rests <= 0, d >= 0):
+            self.when(condition, assign(n, pre(n) + 1))
+
+    with pytest.warns(RuntimeWarning) as said:
+        simulate(compiled(component(write)), 1.0)
+    (text,) = [str(w.message) for w in said]
+    assert text.startswith("'c: when(-a - b + s <= 0)' never happens: from t=0 to t=1 both sides")

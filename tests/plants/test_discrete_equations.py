@@ -28,6 +28,9 @@ def refused(write):
 def test_what_no_discrete_equation_is():
     assert "changes with 'x' between events" in refused(lambda c, x, m: c.discrete_equation(m, 2 * x))
     assert "takes a discrete variable" in refused(lambda c, x, m: c.discrete_equation(x, x > 1))
+    assert "write x for what it is" in refused(lambda c, x, m: c.discrete_equation(m, pre(x) > 1)).lower()
+    assert "an equation reads x" in refused(lambda c, x, m: c.output("y", pre(x)))
+    assert "a condition is on the present" in refused(lambda c, x, m: c.when(pre(x) > 1, assign(m, 1)))
     assert "has an equation already" in refused(lambda c, x, m: [c.discrete_equation(m, x > k) for k in (1, 2)])
 
     def also_assigned(c, x, m):

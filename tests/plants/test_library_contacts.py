@@ -120,6 +120,26 @@ def test_a_string_between_frames():
     measured("events", solution.events.ts[:2], [SLACK, TAUT], 1e-9)
 
 
+@pytest.mark.slow
+def test_a_string_whose_ends_meet():
+    """A body thrown from the hook of its string flies along a parabola until the string is taut; then only the speed
+    across the string is left."""
+    ev, v0, g = EqnEnv(), 0.5, 9.81
+    world, string = planar.World(ev, "world"), planar.String(ev, "string", 1.0)
+    bob = planar.Body(
+        ev, "bob", 2.0, 1.0, initial_x=0.0, initial_y=0.0, initial_angle=0.0, initial_vx=v0, initial_vy=0.0,
+        initial_speed=0.0,
+    )  # fmt: skip
+    system = compiled(world, string, bob, connect=[(world.frame, string.frame_a), (string.frame_b, bob.frame)])
+    t = scipy.optimize.brentq(lambda t: (v0 * t) ** 2 + (g * t**2 / 2) ** 2 - 1, 0.1, 1.0)
+    solution = simulate(system, t + 1e-6, **TIGHT)
+    np.testing.assert_allclose(solution.events.ts[:1], [t], rtol=1e-9)
+    x, y, vx, vy = (solution.events.after[f"bob.{name}"][0] for name in ("x", "y", "vx", "vy"))
+    np.testing.assert_allclose([x, y], [v0 * t, -g * t**2 / 2], rtol=1e-9)
+    across = (x * -g * t - y * v0) / (x**2 + y**2)
+    np.testing.assert_allclose([vx, vy], [-across * y, across * x], rtol=1e-8)
+
+
 # --- stops and ropes -------------------------------------------------------------------------------------------------
 
 
@@ -345,6 +365,8 @@ def test_two_capacitors_joined():
 def test_a_run_that_cannot_begin_in_its_mode(bob):
     with pytest.raises(jd.InitializationError, match=r"cannot begin at t=0 in the mode of 'bob: L - sqrt"):
         simulate(bob, 1.0, initial={"bob.y": -0.7})
+    with pytest.raises(jd.InitializationError, match=r"where 'bob: L - sqrt.* has no finite derivatives"):
+        simulate(bob.with_parameters({"bob.taut": 0.0}), 1.0, initial={"bob.y": 0.0})
     stop = falling(HardStop(EqnEnv(), "stop", touching=True))
     with pytest.raises(jd.InitializationError, match="it is 1, its derivative 0"):
         simulate(stop, 1.0)

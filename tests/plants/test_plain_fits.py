@@ -11,8 +11,10 @@ import pytest
 import scipy.integrate
 from sympy import Eq
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, learning
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, learning, simulate
 from jaxonomy_dae.learning.beginnings import beginning, silent
+from jaxonomy_dae.learning.law_changes import Bumps, answers, changed
+from jaxonomy_dae.learning.process import Kernel
 
 TS = np.linspace(0.1, 4.0, 40)
 NOISE = 1e-2
@@ -78,8 +80,9 @@ def test_a_plain_fit_of_a_network_is_right_and_says_so():
     fit = learning.Problem(system(), record(), train=["c.f"]).fit()
     assert fit.ok and fit.minimum.converged and not fit.reasons
     band = fit.band("c.f", np.linspace(-0.5, 0.4, 10))
-    assert band.inside.all() and (band.spread < 0.05).all()
-    np.testing.assert_array_less(np.abs(band.mean + 0.3 * band.grid), 3.5 * band.spread)
+    assert band.inside.all() and (band.spread < 0.09).all()
+    # The record looks curved: at the end the law is off by 0.08, which weights alone, with a spread of 0.03, call 3 σ.
+    np.testing.assert_array_less(np.abs(band.mean + 0.3 * band.grid), 2 * band.spread)
 
 
 @pytest.mark.long("residuals and their Jacobian")
@@ -102,6 +105,28 @@ def test_what_is_against_a_fit_is_said():
     assert not any("χ²" in reason for reason in estimated.reasons)  # a noise level that is estimated explains any
     short = problem.fit(record(), steps=0, warn=False)
     assert "not yet converged" in short.reasons[0]
+
+
+@pytest.mark.slow
+def test_answers_to_a_law_are_differences_of_runs():
+    """A band of a law as a function follows from how outputs answer where no weight acts alone."""
+    fit = learning.Problem(system(), record(), train=["c.f"], rtol=1e-9, atol=1e-11).fit()
+    places, kernel = np.linspace(-1, 1, 7)[:, None], Kernel(1.0, 0.0, 1.2)
+    bumps = Bumps.of([-0.05], [0.45], places, kernel, float)
+    found = answers(fit, "c.f", bumps, kernel, 1)
+    root = kernel.between(places, places)
+    for k in (0, 3):
+        runs = []
+        for step in (1e-4, -1e-4):
+            heights = jnp.asarray(np.linalg.solve(root, step * np.eye(7)[k]))
+            law = changed(fit.system.neural["c.f"], bumps, heights)
+            there = eqx.tree_at(lambda s: s.neural["c.f"], fit.system, law)
+            runs.append(simulate(there, TS[-1], ts=TS, rtol=1e-10, atol=1e-12)["c.x"])
+        np.testing.assert_allclose(found[:, k], (runs[0] - runs[1]) / 2e-4, rtol=0, atol=1e-4 * np.abs(found).max())
+    process = fit.law_process("c.f")
+    assert process is not None and 0 <= process.share <= 1
+    inside, far = fit.band("c.f", np.array([0.0, 0.2])), fit.band("c.f", np.array([3.0]))
+    assert far.spread[0] > 5 * inside.spread.max()
 
 
 class Spring(Component):

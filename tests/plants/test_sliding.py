@@ -91,6 +91,25 @@ def test_two_solutions_end_the_run():
     assert np.isnan(run["c.x"][1])
 
 
+class Turning(Component):
+    """x' = u with u = y − 1 above zero and u = 1 − y below it, y = t: drawn to zero before t = 1, and away after."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, y, u = self.variable("x", start=0.3, fixed=True), self.variable("y"), self.variable("u")
+        self.add_equations(Eq(der(x), u), Eq(y, ev.t))
+        self.sliding(x, u - (y - 1), u + (y - 1))
+
+
+@pytest.mark.slow
+def test_fields_that_turn_away_along_the_surface_end_the_run():
+    """From x = 0.3 it slides from t − t²/2 = 0.3 on. It went on along the surface, which no longer attracts it."""
+    run = simulate(compiled(Turning(EqnEnv(), "c")), 2.0, ts=jnp.array([0.9, 2.0]), **TIGHT)
+    assert "both fields lead away from here on" in run.events.terminated
+    np.testing.assert_allclose(run.events.ts[:2], [1 - np.sqrt(0.4), 1.0], rtol=1e-9)
+    assert abs(run["c.x"][0]) < 1e-12 and np.isnan(run["c.x"][1])
+
+
 def test_names_of_several():
     """A second one with the default name was refused."""
 

@@ -277,6 +277,11 @@ def test_plot(solution):
     _, given = plt.subplots()
     assert solution.plot("spring.f", ax=given) is given
     assert given.get_ylabel() == "spring.f / N"
+    starts = jnp.array([[1.0, 0.0], [2.0, 0.0]])
+    batch = eqx.filter_vmap(lambda x: solution_of(solution.system, TS, jnp.broadcast_to(x, (3, 2))))(starts)
+    axes = batch.plot("mass.s")  # a bare error of Matplotlib
+    for line, s in zip(axes.lines, (1.0, 2.0), strict=True):
+        np.testing.assert_array_equal(line.get_xydata(), np.stack([TS, np.full(3, s)], axis=1))
     plt.close("all")
 
 

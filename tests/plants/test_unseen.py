@@ -100,7 +100,7 @@ def test_a_known_start_is_taken():
 def test_what_cannot_be_asked_is_refused():
     with pytest.raises(ModelError, match="new data are an Experiment; got a dict"):
         Unseen.of(fit(), {"c.x": TS}, None)
-    with pytest.raises(ModelError, match="first is a number of rows"):
+    with pytest.raises(ModelError, match="first, the number of rows, is a whole number"):
         fit().score(RECORDS[0], first=0)
     with pytest.raises(ModelError, match="first= goes with a new experiment"):
         fit().predict("c.x", first=3)

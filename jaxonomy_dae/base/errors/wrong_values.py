@@ -4,6 +4,8 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 from .kinds import ModelError
 
 
@@ -32,12 +34,12 @@ def by_name(what: str, given: object, example: str) -> dict[str, Any]:
 
 
 def whole_number(value: object, what: str, least: int = 1) -> int:
-    """The value, if it is an integer and not less than `least`.
+    """The value, if it is an integer, of NumPy too, and not less than `least`.
 
     **Raises:**
 
     - `ModelError` for anything else, `what` it was for.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ModelError(f"{what} is a whole number ≥ {least}; got {value!r}")
-    return value
+    return int(value)

@@ -9,6 +9,8 @@ from .plan import SystemPlan
 
 ROOM = 64  # answers kept for one plan; each is one question of a user's, such as the names given in `initial`
 
+_NONE: Any = object()
+
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -21,11 +23,12 @@ def remembered(function: Callable[Concatenate[SystemPlan, _P], _T]) -> Callable[
     def call(plan: SystemPlan, *args: _P.args, **kwargs: _P.kwargs) -> _T:
         answers = known.setdefault(plan, {})
         key = args, tuple(sorted(kwargs.items()))
-        if key not in answers:
+        found = answers.get(key, _NONE)
+        if found is _NONE:
             found = function(plan, *args, **kwargs)
             while len(answers) >= ROOM:
                 answers.pop(next(iter(answers)), None)
-            answers[key] = found
-        return answers[key]
+            answers[key] = found  # another thread may drop it at once
+        return found
 
     return call

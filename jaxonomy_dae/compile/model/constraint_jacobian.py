@@ -100,6 +100,12 @@ def values_and_errors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The numbers of all entries at a point, and bounds of their errors, from those of all quantities, (quantities +
     1,)."""
+    found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def both(group: ExtendedGroup) -> tuple[np.ndarray, np.ndarray]:
+        if id(group) not in found:
+            found[id(group)] = group.partials_with_errors(at, known)
+        return found[id(group)]
+
     where = groups, extended, entries
-    errors = gathered(*where, lambda group: group.partial_errors(at, known))
-    return gathered(*where, lambda group: group.partials(at)), errors
+    return gathered(*where, lambda group: both(group)[0]), gathered(*where, lambda group: both(group)[1])

@@ -130,11 +130,13 @@ class QuantityGroup(Group):
         return self._stacked(out) * self.factor
 
     @np.errstate(all="ignore")
-    def partial_errors(self, at: Point, errors: np.ndarray) -> Float[np.ndarray, "n slots"]:
-        """Bounds of the errors of these partial derivatives, given those of all quantities, (quantities + 1,)."""
+    def partials_with_errors(
+        self, at: Point, errors: np.ndarray
+    ) -> tuple[Float[np.ndarray, "n slots"], Float[np.ndarray, "n slots"]]:
+        """These partial derivatives and bounds of their errors, given those of all quantities, (quantities + 1,)."""
         slots, *others = self._arguments(at)
-        out = self.template.partial_errors(slots, [np.abs(e) for e in self.slots(errors)], *others)
-        return self._stacked(out) * np.abs(self.factor)
+        values, bounds = self.template.partials_with_errors(slots, [np.abs(e) for e in self.slots(errors)], *others)
+        return self._stacked(values) * self.factor, self._stacked(bounds) * np.abs(self.factor)
 
     @np.errstate(all="ignore")
     def partials_along(self, at: Point, move: np.ndarray) -> Float[np.ndarray, "n slots"]:

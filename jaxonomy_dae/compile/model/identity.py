@@ -90,8 +90,8 @@ class _Walk:
             case np.ndarray() if part.dtype == object:
                 return self._all(f"{name} {part.shape}", part.ravel().tolist())
             case np.ndarray() | np.generic() | jax.Array():
-                array = np.ascontiguousarray(part)
-                return _digest(f"{name} {array.dtype} {array.shape}", array.data if array.size else b"")
+                array = np.ascontiguousarray(part)  # which makes a vector of what has no axes
+                return _digest(f"{name} {array.dtype} {part.shape}", array.data if array.size else b"")
             case list() | tuple() if _PLAIN.issuperset(map(type, part)):
                 return _digest(name, repr(part).encode())  # at once: there may be millions of names
             case list() | tuple():

@@ -63,8 +63,9 @@ def generic_jacobian(
             partial = generic(rng, (n, k))
             error = KNOWN * partial
         else:
-            first, second = (group.partials(at) for at in samples)
-            of_first, of_second = (group.partial_errors(at, KNOWN * np.abs(at.values)) for at in samples)
+            (first, of_first), (second, of_second) = (
+                group.partials_with_errors(at, KNOWN * np.abs(at.values)) for at in samples
+            )
             # Zero on one branch is not zero on all; and what is not real at one point may be so at the other.
             other = (np.abs(first) <= of_first) | ~np.isfinite(first)
             partial, error = np.where(other, second, first), np.where(other, of_second, of_first)

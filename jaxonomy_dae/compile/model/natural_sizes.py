@@ -134,8 +134,7 @@ class Factors:
     parameters, other values of these change the right-hand side alone."""
 
     def __init__(self):
-        self._digest = b""
-        self._factors: GraphElimination
+        self._last: tuple[bytes, GraphElimination] | None = None  # a digest of the matrix, and its factors
 
     def least_squares(self, matrix: Any, right: np.ndarray) -> np.ndarray:
         """The x of least norm with A·x near b, by normal equations: logarithms need a few digits, of which an iterative
@@ -144,9 +143,11 @@ class Factors:
         digest, damping = hashlib.sha256(repr(matrix.shape).encode()), DAMPING
         for part in (matrix.indptr, matrix.indices, matrix.data):
             digest.update(part.data)
-        if digest.digest() != self._digest:  # the matrix itself would take as much memory as its factors
-            self._digest, self._factors = digest.digest(), _normal(matrix, damping)
-        found = self._factors.solve(matrix.T @ right)
+        # The matrix itself would take as much memory as its factors. Another thread may put others in their place.
+        last = self._last
+        if last is None or last[0] != digest.digest():
+            last = self._last = digest.digest(), _normal(matrix, damping)
+        found = last[1].solve(matrix.T @ right)
         # Powers are differences, known to a few digits. What they hardly tell, as the time of a mechanism that nothing
         # drives, is told by their errors, and would move without bound.
         while np.abs(found).max(initial=0.0) > FARTHEST and damping < 1.0:

@@ -151,10 +151,11 @@ class SymbolicTemplate(AbstractTemplate):
     def _partials_with_errors(self) -> KernelWithErrors:
         return KernelWithErrors(self.partials, self._labels)
 
-    def partial_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple:
+    def partials_with_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple[tuple, tuple]:
         given = [*parameters, *coefficients, t]
         known = [KNOWN * np.abs(v) for v in given]
-        return tuple(self._partials_with_errors([*slots, *given], [*errors, *known])[1])
+        found, bounds = self._partials_with_errors([*slots, *given], [*errors, *known])
+        return tuple(found), tuple(bounds)
 
     @functools.cached_property
     def _terms(self) -> Sequence[Node]:

@@ -49,12 +49,12 @@ class AbstractTemplate(abc.ABC):
     def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax") -> Numeric:
         """The magnitude of the residual's terms (see `expressions.magnitude`); `sizes` are the magnitudes of slots."""
 
-    def partial_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple:
-        """Bounds of the errors of `partial_values` in NumPy, where `errors` are those of slots, and parameters and
+    def partials_with_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple[tuple, tuple]:
+        """`partial_values` in NumPy and bounds of their errors, where `errors` are those of slots, and parameters and
         coefficients are known to `KNOWN`. Here for partial derivatives that are given numbers, or in which nothing is
         seen."""
         found = self.partial_values(slots, parameters, coefficients, t, networks, backend="numpy")
-        return tuple(KNOWN * np.abs(v) for v in found)
+        return tuple(found), tuple(KNOWN * np.abs(v) for v in found)
 
     def term_values(self, slots, parameters, coefficients, t) -> list:
         """The values of the terms that the residual is a sum of, in NumPy; none where the partial derivatives show them

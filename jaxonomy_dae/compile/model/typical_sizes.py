@@ -137,7 +137,8 @@ def _balanced(
     there, where = constants(balance.with_constants, parameters)
     there, parameters = rounded(there), rounded(parameters[balance.read])
     key = size.tobytes(), parameters.tobytes(), there.tobytes(), where.tobytes()
-    if key not in balance.found:
+    found = balance.found.get(key)
+    if found is None:
         every = np.zeros(int(balance.read.max(initial=-1)) + 1)
         every[balance.read] = parameters
         sizes, _ = natural_sizes(
@@ -146,7 +147,8 @@ def _balanced(
         )  # fmt: skip
         while len(balance.found) >= ROOM:
             balance.found.pop(next(iter(balance.found)), None)
-        balance.found[key] = 10.0 ** np.clip(np.log10(np.abs(sizes)), -DECADES, DECADES)
+        found = 10.0 ** np.clip(np.log10(np.abs(sizes)), -DECADES, DECADES)
         # The array is handed to all who ask; one that changed it would change the sizes of all others.
-        balance.found[key].flags.writeable = False
-    return balance.found[key]
+        found.flags.writeable = False
+        balance.found[key] = found  # another thread may drop it at once
+    return found

@@ -28,7 +28,16 @@ def check_pivots(
     if not len(zero):
         return
     group, place = locate(groups, int(zero[0]))
-    values = [f"{parameters.names[p]} = {numbers[p]:g}" for p in dict.fromkeys(group.parameter[place].tolist())]
+    read = list(dict.fromkeys(group.parameter[place].tolist()))
+    values = [f"{parameters.names[p]} = {numbers[p]:g}" for p in read]
+    modes = [v for p, v in zip(read, values, strict=True) if p in parameters.discrete]
+    if modes:
+        raise StructuralError(
+            f"the equation {group.provenance[place]} determines nothing in the mode {', '.join(modes)}: the "
+            "coefficient of what it should determine is zero. If it fixes a state there, put storage between what "
+            "switches and that state (a capacitor, a volume of fluid), or let the mode hold the state back, with "
+            "self.complementary(state, other, order=1) or self.either(…, order=1)"
+        )
     raise StructuralError(
         f"the equation {group.provenance[place]} determines nothing for {', '.join(values)}: the coefficient of what "
         "it should determine is zero. Give other values, or leave the component out."
@@ -58,7 +67,7 @@ def _zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values)
         reads = np.zeros(group.variable.shape, np.int64)  # whatever the slots are: these entries are constant
         own = group.reading(reads)
         at = Point.of(np.ones(1), values, 0.0)
-        coefficient = np.where(used, own.partials(at), 0.0)[:, slots].sum(axis=1)
-        bound = np.where(used, own.partial_errors(at, np.zeros(2)), 0.0)[:, slots].sum(axis=1)
+        found_there = own.partials_with_errors(at, np.zeros(2))
+        coefficient, bound = (np.where(used, x, 0.0)[:, slots].sum(axis=1) for x in found_there)
         found.append(equation[used.any(axis=1) & (np.abs(coefficient) <= bound)])
     return np.concatenate(found) if found else np.zeros(0, np.int64)

@@ -77,10 +77,10 @@ class HighestDerivatives:
             else:
                 at = Point.of(point.ravel(), self.values, 0.37 + 0.1 * trial)
                 own = group.reading(np.arange(point.size).reshape(point.shape))
-                errors = own.partial_errors(at, KNOWN * np.abs(at.values))
+                values, errors = own.partials_with_errors(at, KNOWN * np.abs(at.values))
                 # Numbers of a combination are known to the errors of its terms.
                 errors = np.maximum(errors, group.error) if isinstance(group, CombinedGroup) else errors
-                found = own.partials(at), errors
+                found = values, errors
             self._partials[g, trial] = found
         return self._partials[g, trial]
 
@@ -122,7 +122,7 @@ class HighestDerivatives:
         at = Point.of(size * somewhere(pairs[:, 0], pairs[:, 1], trial), self.values, 0.37 + 0.1 * trial)
         found = []
         for group, place in zip(groups, self._places(equations, columns), strict=True):
-            partials, errors = group.partials(at), group.partial_errors(at, KNOWN * np.abs(at.values))
+            partials, errors = group.partials_with_errors(at, KNOWN * np.abs(at.values))
             there = place.own, place.slot
             found.append((place.row, place.column, partials[there], errors[there]))
         return BlockMatrix.of((len(equations), len(columns)), found)

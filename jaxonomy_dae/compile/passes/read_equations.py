@@ -8,7 +8,7 @@ from ...graph.expressions.from_sympy import UnsupportedExpression, read, symbols
 from ...graph.expressions.node import Node
 from ...graph.expressions.to_sympy import shortened
 from ...write.component import line_of
-from ...write.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
+from ...write.symbols import EarlierSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Lines, Provenances, Written
 from ..model.symbolic import canonical, linear_coefficients
@@ -80,6 +80,11 @@ def slots_of(
 
     symbols = [s for s in symbols_of(expression) if symbol_label(s) in graph.leaves]
     for s in symbols:
+        if isinstance(s, EarlierSymbol):
+            raise ModelError(
+                f"component '{model.path(i)}': 0 = {shortened(expression)}: {s} is the value before an event, which "
+                f"what events write may read; an equation reads {s.path}"
+            )
         if not isinstance(s, VariableSymbol | ParameterSymbol | TimeSymbol):
             raise ModelError(
                 f"component '{model.path(i)}': the symbol '{s}' was declared by no component; "

@@ -98,23 +98,19 @@ def _shortened(needed: Needed) -> Needed:
     """Removes redundant intersections from a union: (c ∧ p) ∨ (¬c ∧ p) becomes p, and p ∨ (p ∧ q) becomes p. A union of
     more than `LARGEST` intersections becomes `ALWAYS`."""
     parts = set(needed)
-    changed = True
-    while changed and len(parts) > 1:
-        changed = False
-        for part in sorted(parts, key=len):
-            if any(other < part for other in parts):
-                parts.discard(part)
-                changed = True
-                break
-            merged = None
+    while len(parts) > 1:
+        # All pairs at once (Quine 1955): of c ∧ d, c ∧ ¬d and ¬c ∧ ¬d, the second goes with either other one, and the
+        # order of a set, which differs between processes, would choose.
+        merged, used = set(), set()
+        for part in parts:
             for condition, holds in part:
                 rest = part - {(condition, holds)}
                 if rest | {(condition, not holds)} in parts:
-                    merged = rest, rest | {(condition, not holds)}
-                    break
-            if merged is not None:
-                parts -= {part, merged[1]}
-                parts.add(merged[0])
-                changed = True
-                break
+                    merged.add(rest)
+                    used.add(part)
+        shorter = merged | (parts - used)
+        shorter = {part for part in shorter if not any(other < part for other in shorter)}
+        if shorter == parts:
+            break
+        parts = shorter
     return frozenset(parts) if len(parts) <= LARGEST else ALWAYS

@@ -6,11 +6,13 @@ derivative is zero.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.scipy.special as jsp
 import numpy as np
@@ -85,19 +87,62 @@ def _zero(*arguments: Node) -> tuple[Node, ...]:
     return (ZERO,) * len(arguments)
 
 
-def _polygamma(xp, special, n, x):
-    return special.digamma(x) if n == 0 else special.polygamma(n, x)
-
-
 def _unary(name, numpy, jax, slope, symbol, safe=None) -> Function:
     return Function(name, numpy, jax, lambda u: (slope(u),), symbol, (safe,))
 
 
-def _bessel_i(order: int):
-    def jax(x):
-        return jsp.i0(x) if order == 0 else jsp.i1(x)
+def _with_slope(function, slope):
+    """A function of JAX with a derivative other than JAX's own."""
 
-    return jax
+    @jax.custom_jvp
+    def found(x):
+        return function(x)
+
+    found.defjvps(lambda moved, _, x: slope(x) * moved)
+    return found
+
+
+def _polygamma(special, n, x):
+    return special.digamma(x) if n == 0 else special.polygamma(n, x)
+
+
+def _polygamma_in_jax(n: int):
+    """ψₙ, for negative x by ψₙ(x) = (−1)ⁿ ψₙ(1 − x) − π dⁿcot(πx)/dxⁿ (DLMF 5.15.6): JAX (0.10.2) sums a series that
+    diverges there."""
+    slope = np.polynomial.Polynomial([0.0, 1.0])  # of cot(πx), in powers of the cotangent
+    for _ in range(n):
+        slope = slope.deriv() * np.polynomial.Polynomial([-np.pi, 0.0, -np.pi])
+
+    def function(x):
+        negative = x < 0
+        right = _polygamma(jsp, n, jnp.where(negative, 1 - x, x))
+        # The period of the cotangent first: πx loses the digits of what x has beside a whole number.
+        inside = jnp.where(negative, x - jnp.round(x), 0.25)
+        cotangent = 1 / jnp.tan(jnp.pi * inside)
+        left = (-1) ** n * right - np.pi * jnp.polyval(jnp.asarray(slope.coef[::-1], cotangent.dtype), cotangent)
+        return jnp.where(negative, left, right)
+
+    return function
+
+
+# JAX's second derivatives of these are its own ψ₁.
+_digamma = _polygamma_in_jax(0)
+_gamma = _with_slope(jsp.gamma, lambda x: _gamma(x) * _digamma(x))
+_gammaln = _with_slope(jsp.gammaln, _digamma)
+
+
+# JAX's derivative of I₀ follows |x|: at zero it is 1 instead of 0.
+_i0 = _with_slope(jsp.i0, lambda x: _i1(x))
+_i1 = _with_slope(jsp.i1, lambda x: _i1_slope(x))
+
+
+def _i1_slope(x):
+    """As `_bessel_i1_slope`, in JAX."""
+    square = x * x
+    inside = square < 1
+    near, far = jnp.where(inside, square, 0.0), jnp.where(inside, 1.0, x)
+    series = functools.reduce(lambda total, c: total * near + float(c), reversed(_SERIES), 0.0)
+    return jnp.where(inside, series, _i0(far) - _i1(far) / far)
 
 
 _SERIES = [Fraction(2 * k + 1, 2 ** (2 * k + 1) * math.factorial(k) * math.factorial(k + 1)) for k in range(13)]
@@ -125,7 +170,8 @@ def _atan2_partials(y: Node, x: Node) -> tuple[Node, Node]:
 
 
 def _heaviside(xp):
-    return lambda x, at_zero: xp.where(x > 0, 1.0, xp.where(x < 0, 0.0, at_zero))
+    # What is not a number is no zero, and stays what it is.
+    return lambda x, at_zero: xp.where(x > 0, 1.0, xp.where(x < 0, 0.0, xp.where(x == 0, at_zero, x)))
 
 
 def _hypot(xp):
@@ -134,7 +180,7 @@ def _hypot(xp):
     def function(a, b):
         square = a * a + b * b
         # √0 has an infinite slope, and a gradient keeps ∞·0 of it, which is no number, though its branch is not taken.
-        away = square > 0
+        away = square != 0  # true of what is not a number, too
         return xp.where(away, xp.sqrt(xp.where(away, square, 1.0)), 0.0)
 
     return function
@@ -210,11 +256,11 @@ _rows = [
         sympy.erfinv,
         0.0,
     ),
-    _unary("gamma", ssp.gamma, jsp.gamma, lambda u: multiply(apply("gamma", u), polygamma(0, u)), sympy.gamma, 1.0),
+    _unary("gamma", ssp.gamma, _gamma, lambda u: multiply(apply("gamma", u), polygamma(0, u)), sympy.gamma, 1.0),
     _unary(
         "loggamma",
         _log_gamma(ssp.gammaln, np),
-        _log_gamma(jsp.gammaln, jnp),
+        _log_gamma(_gammaln, jnp),
         lambda u: polygamma(0, u),
         sympy.loggamma,
         1.0,
@@ -222,17 +268,17 @@ _rows = [
     _unary(
         "logabsgamma",
         ssp.gammaln,
-        jsp.gammaln,
+        _gammaln,
         lambda u: polygamma(0, u),
         lambda u: sympy.log(sympy.Abs(sympy.gamma(u))),
         1.0,
     ),
     Function("gammasign", ssp.gammasgn, jsp.gammasgn, _zero, lambda u: sympy.sign(sympy.gamma(u))),
-    _unary("besseli0", ssp.i0, _bessel_i(0), lambda u: apply("besseli1", u), lambda u: sympy.besseli(0, u), 0.0),
+    _unary("besseli0", ssp.i0, _i0, lambda u: apply("besseli1", u), lambda u: sympy.besseli(0, u), 0.0),
     _unary(
         "besseli1",
         ssp.i1,
-        _bessel_i(1),
+        _i1,
         _bessel_i1_slope,
         lambda u: sympy.besseli(1, u),
         1.0,
@@ -271,8 +317,8 @@ def _polygamma_row(name: str) -> Function:
     order = int(name.removeprefix(_POLYGAMMA))
     return Function(
         name,
-        lambda x: _polygamma(np, ssp, order, x),
-        lambda x: _polygamma(jnp, jsp, order, x),
+        lambda x: _polygamma(ssp, order, x),
+        _polygamma_in_jax(order),
         lambda x: (polygamma(order + 1, x),),
         lambda x: sympy.polygamma(order, x),
         (1.0,),

@@ -82,7 +82,7 @@ class Kernel:
                 # derivatives are infinite: zero times infinity would be left of it in gradients.
                 active = is_active(found, guard)
                 inside = [
-                    v if s is None or isinstance(v, float) else xp.where(active, v, s)
+                    v if s is None or isinstance(v, float) and v != 0.0 else xp.where(active, v, s)
                     for v, s in zip(inside, safe, strict=True)
                 ]
             found[k] = function(*inside)
@@ -203,7 +203,8 @@ def _product(exponents: Sequence[Number], xp: ModuleType) -> _Operation:
 
     def function(*bases: Numeric) -> Numeric:
         over, under = None, None
-        if any(_is_nought(base) and exponent > 0 for base, exponent in zip(bases, exponents, strict=True)):
+        noughts = [exponent for base, exponent in zip(bases, exponents, strict=True) if _is_nought(base)]
+        if noughts and min(noughts) > 0:
             return 0.0
         for base, exponent in zip(bases, exponents, strict=True):
             if exponent > 0:
@@ -214,6 +215,8 @@ def _product(exponents: Sequence[Number], xp: ModuleType) -> _Operation:
                 under = value if under is None else under * value
         if under is None:
             return over
-        return (1.0 if over is None else over) / under
+        over = 1.0 if over is None else over
+        # Where both are Python's numbers, a division by zero would be an error.
+        return xp.true_divide(over, under) if _is_nought(under) else over / under
 
     return function

@@ -11,6 +11,8 @@ from typing import NamedTuple
 from .functions import HALF, apply
 from .node import Node, Number, constant, linear, multiply, number, power, scale, split
 
+FARTHEST = 300.0  # exp(300) and exp(−300) have room for other factors in double precision
+
 
 class _OnePlusExp(NamedTuple):
     """factor·(1 + exp(exponent)), the factor positive."""
@@ -64,9 +66,12 @@ def product(*nodes: Node) -> Node:
             # exp(u)·logistic(d − u) = exp(d)·logistic(u − d)
             powers[grows] -= shared
             powers[falls] -= shared
-            c = number(multiply(constant(c), power(apply("exp", constant(shift)), shared)))
-            assert c is not None
-            risen = apply("logistic", linear([(1, u)], -shift))
+            if abs(shared * shift) < FARTHEST:
+                c = number(multiply(constant(c), power(apply("exp", constant(shift)), shared)))
+                assert c is not None
+                risen = apply("logistic", linear([(1, u)], -shift))
+            else:  # exp(d) overflows, or is lost; so d stays beside the logarithm of the other factor
+                risen = apply("exp", linear([(-1, apply("softplus", falls.arguments[0]))], shift))
             powers[risen] = powers.get(risen, 0) + shared
     return multiply(constant(c), *(power(b, e) for b, e in powers.items()))
 

@@ -74,8 +74,8 @@ def _factored(matrix: object, errors: object, scales: Callable) -> SparseRank:
     except RuntimeError:
         return SparseRank(scaled, r, c, None, np.inf, np.inf)
     inverse = linalg.LinearOperator(scaled.shape, matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
+    # With one column the estimate draws no random numbers: those of `numpy.random` are the user's.
     size = float(linalg.onenormest(inverse, t=1))
     noise = sp.csr_array(sp.diags_array(r) @ errors @ sp.diags_array(c))
-    return SparseRank(
-        scaled, r, c, factors, float(linalg.onenormest(scaled) * size), float(abs(noise).sum(axis=0).max() * size)
-    )
+    norm, of_noise = (float(abs(matrix).sum(axis=0).max()) for matrix in (scaled, noise))
+    return SparseRank(scaled, r, c, factors, norm * size, of_noise * size)

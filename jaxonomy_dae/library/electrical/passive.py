@@ -23,7 +23,8 @@ class HeatedResistor(TwoPin):
     """A resistor that changes with its temperature and heats what it touches: v = R·(1 + alpha·(T − T_ref))·i, the heat
     v·i leaves at the port `heat`.
 
-    `R` > 0 in ohm at `T_ref` (kelvin), `alpha` in 1/kelvin, `T` the temperature of the port.
+    `R` > 0 in ohm at `T_ref` (kelvin), `alpha` in 1/kelvin, `T` the temperature of the port. `T_ref` is a guess of it:
+    beside radiation there may be solutions below zero kelvin, too.
     """
 
     def __init__(self, ev: EqnEnv, name: str, R: Value = 1.0, alpha: Value = 0.0, T_ref: Value = 293.15):
@@ -33,8 +34,11 @@ class HeatedResistor(TwoPin):
         reference = self.parameter("T_ref", T_ref, unit="K")
         voltage, current = self._two_pins()
         heat = self.port("heat", Thermal)
+        T = self.variable("T", start=reference, unit="K")
         self.add_equations(
-            Eq(voltage, r * (1 + slope * (heat.T - reference)) * current), Eq(heat.Q_flow, -voltage * current)
+            Eq(T, heat.T),
+            Eq(voltage, r * (1 + slope * (T - reference)) * current),
+            Eq(heat.Q_flow, -voltage * current),
         )
 
 

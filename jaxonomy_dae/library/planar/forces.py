@@ -50,11 +50,12 @@ class String(TwoFrames):
     """A massless string that cannot be stretched, between two frames that it keeps no further apart than its length.
 
         dx = frame_b.x − frame_a.x,   dy = frame_b.y − frame_a.y,   s = √(dx² + dy²) ≤ length
-        frame_b.fx = f·dx/s,   frame_b.fy = f·dy/s,   0 = frame_a.f + frame_b.f
+        frame_b.fx = f·dx/length,   frame_b.fy = f·dy/length,   0 = frame_a.f + frame_b.f
 
-    While s < length it is slack, and f = 0; while it is taut, the force `f` ≥ 0 pulls its ends together. Where it
-    becomes taut, the speed at which its ends part is taken away, by an impulse (Pfeiffer & Glocker 1996, "Multibody
-    Dynamics with Unilateral Contacts", chapter 8). The discrete variable `taut` is 1 or 0.
+    While s < length it is slack, and f = 0; its ends may meet. While it is taut, s = length, and the force `f` ≥ 0
+    pulls its ends together. Where it becomes taut, the speed at which its ends part is taken away, by an impulse
+    (Pfeiffer & Glocker 1996, "Multibody Dynamics with Unilateral Contacts", chapter 8). The discrete variable `taut` is
+    1 or 0.
 
     **Arguments:**
 
@@ -72,12 +73,13 @@ class String(TwoFrames):
         a, b = self._two_frames()
         f = self.variable("f", unit="N")
         dx, dy = b.x - a.x, b.y - a.y
-        s = sqrt(dx**2 + dy**2)
-        self.output("s", s, unit="m")
-        self.add_equations(Eq(b.fx, f * dx / s), Eq(b.fy, f * dy / s), Eq(a.tau, 0), Eq(b.tau, 0))
+        self.output("s", sqrt(dx**2 + dy**2), unit="m")
+        self.add_equations(Eq(b.fx, f * dx / longest), Eq(b.fy, f * dy / longest), Eq(a.tau, 0), Eq(b.tau, 0))
         self.add_equations(Eq(a.fx + b.fx, 0), Eq(a.fy + b.fy, 0))
         start = yes_or_no(taut, name, "taut")
-        self.complementary(longest - s, f, "taut", order=2, clearance=tiny, start=start)
+        # In the first order near the length this is length − s, which has no derivative where the ends meet.
+        slack = (longest**2 - dx**2 - dy**2) / (2 * longest)
+        self.complementary(slack, f, "taut", order=2, clearance=tiny, start=start)
 
 
 class Force(Component):

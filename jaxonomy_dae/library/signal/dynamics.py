@@ -86,9 +86,15 @@ class StateSpace(Component):
         a, b, c = (np.atleast_2d(finite(m, name, what)) for what, m in (("A", A), ("B", B), ("C", C)))
         n, m, p = a.shape[0], b.shape[1], c.shape[0]
         d = np.zeros((p, m)) if D is None else np.atleast_2d(finite(D, name, "D"))
-        for what, matrix, shape in (("A", a, (n, n)), ("B", b, (n, m)), ("C", c, (p, n)), ("D", d, (p, m))):
+        for what, matrix, shape in (
+            ("A", a, (n, n)),
+            ("B", b, (n, 1 if np.ndim(B) == 1 and n > 1 else m)),
+            ("C", c, (p, n)),
+            ("D", d, (p, m)),
+        ):
             if matrix.shape != shape:
-                raise ModelError(f"'{name}': {what} has shape {matrix.shape}, expected {shape}")
+                column = ": one input's column is [[b1], [b2], …]" if what == "B" and np.ndim(B) == 1 else ""
+                raise ModelError(f"'{name}': {what} has shape {matrix.shape}, expected {shape}{column}")
         starts = [0.0] * n if initial_x is None else row(initial_x, name, "initial_x")
         if len(starts) != n:
             raise ModelError(f"'{name}': initial_x has {len(starts)} entries, expected {n}")

@@ -81,7 +81,7 @@ def check_method(system: AcausalSystem, solver: Solver, adjoint: PyTree, stepsiz
 
 def check_steps(system: AcausalSystem, ts: Times, dtmax: Time, max_steps: Any) -> None:
     """Raises a `ModelError` for steps that are too many to be saved, and limits that are no numbers."""
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
         raise ModelError(f"max_steps must be a positive integer; got {_told(max_steps)}")
     room = (max_steps + 1) * system.plan.n_state * system.parameters.values.dtype.itemsize
     if ts is None and room > MOST_ROOM:

@@ -22,7 +22,7 @@ SHOWN = 12  # events in the text of a log
 
 class EventLog(eqx.Module):
     """The events of a run, one row each, up to the log's capacity; `count` counts those beyond it, too. `iteration` is
-    how far repeated events were at the last instant."""
+    how far repeated events were at the last instant, `size` the largest magnitude of each guard of late."""
 
     ts: Float[Array, "*batch events"]
     which: Float[Array, "*batch events"]
@@ -32,6 +32,7 @@ class EventLog(eqx.Module):
     before: Float[Array, "*batch rows m"]
     after: Float[Array, "*batch rows m"]
     iteration: Iteration | None = None
+    size: Float[Array, "*batch guards"] | None = None
 
     @classmethod
     def empty(cls, batch: tuple[int, ...], m: int, dtype: DTypeLike) -> "EventLog":
@@ -45,7 +46,8 @@ class EventLog(eqx.Module):
         table: Any = state.table
         ts, which, rate = (table.log[:, k] for k in range(3))
         frozen = jax.lax.stop_gradient((which, jnp.abs(rate), state.count, state.stuck))
-        return cls(ts, *frozen, table.sides[:, 0], table.sides[:, 1], jax.lax.stop_gradient(state.iteration))
+        last = jax.lax.stop_gradient((state.iteration, state.size))
+        return cls(ts, *frozen, table.sides[:, 0], table.sides[:, 1], *last)
 
 
 class Events:
@@ -152,11 +154,10 @@ class Side:
         if not ts.shape[-1]:
             return ts
         first = self._first()
-        if rows.ndim > 2:
-            return eqx.filter_vmap(_observed, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0), 0, None, None))(
-                system, ts, rows, inputs, first, quantity, factor
-            )
-        return _observed(system, ts, rows, inputs, first, quantity, factor)
+        observed = _observed
+        for _ in range(rows.ndim - 2):  # the axes of a batch
+            observed = eqx.filter_vmap(observed, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0), 0, None, None))
+        return observed(system, ts, rows, inputs, first, quantity, factor)
 
 
 def _observed(

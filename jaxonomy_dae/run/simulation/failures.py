@@ -179,6 +179,13 @@ def mode_at_start(system: AcausalSystem, inputs: Inputs, t0: Time, x0: State) ->
     moved = np.abs(projected - np.asarray(x0))[:n] / (np.abs(np.asarray(x0))[:n] + typical)
     if (moved <= CONSISTENT).all():
         return ""
+    lost = np.unique(held.table.owner[~np.isfinite(levels)]).tolist()
+    if lost:
+        return (
+            f"the run cannot begin at t={float(t0):g}, where {some([repr(held.table.text[k]) for k in lost])} has no "
+            "finite derivatives, as a root at zero: begin elsewhere, or write it without, as L**2 - x**2 - y**2 in "
+            "place of L - sqrt(x**2 + y**2)"
+        )
     lines = []
     for k in np.flatnonzero(active > 0).tolist():
         values = levels[held.table.owner == k]

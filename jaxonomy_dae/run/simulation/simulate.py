@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -37,6 +38,7 @@ from ..system.system_at import SystemAt
 from .arguments import check_method, check_parameters, check_start, check_steps, check_switches, check_system
 from .failures import OKAY, codes, explain, is_code, mode_at_start, raised
 from .from_state import check_state
+from .idle_conditions import always_equal
 from .integration import Given, Options, Outcome, run, run_compiled
 from .preparation import term_of
 from .saved_state import Memory, SavedState, initial_time
@@ -170,6 +172,10 @@ def simulate(
     check_method(system, solver, adjoint, stepsize_controller)
     check_steps(system, ts, dtmax, max_steps)
     check_start(system, t0, t1, ts, initial)
+    # NumPy's truths and integers are no Python ones: `np.False_ is False` does not hold.
+    save_events, throw = (value if value is None else bool(value) for value in (save_events, throw))
+    max_steps, progress = int(max_steps), bool(progress)
+    max_events = None if max_events is None else int(max_events)
     t0 = initial_time(t0, initial)
     dtype = system.parameters.values.dtype
     read = read_inputs(system.plan, dtype, inputs)
@@ -379,6 +385,9 @@ class _Call:
         solution = call._solution(outcome, counts, saved, memory)
         if self.throw is not False and not is_code(outcome.result, *OKAY):
             raise call._failure(solution, outcome)
+        idle = always_equal(solution) if self.throw is not False else ""
+        if idle:
+            warnings.warn(idle, RuntimeWarning, stacklevel=4)
         return solution
 
     def _is_stiff(self, outcome: Outcome) -> bool:

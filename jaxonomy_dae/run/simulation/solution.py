@@ -1,5 +1,6 @@
 """Solutions: every variable by name."""
 
+import operator
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from html import escape
@@ -100,8 +101,13 @@ class Solution(eqx.Module):
         - `ModelError` if there is no such row, or the run did not reach it.
         """
         n = self.ts.shape[-1]
-        if not is_traced(k) and not -n <= int(k) < n:
-            raise ModelError(f"solution.at({int(k)}): there are {n} saved times")
+        if not is_traced(k):
+            try:
+                k = operator.index(k)
+            except TypeError:
+                raise ModelError(f"solution.at takes the number of a saved time, an integer; got {k!r}") from None
+            if not -n <= k < n:
+                raise ModelError(f"solution.at({k}): there are {n} saved times")
 
         def cut(rows: Numeric, place: Numeric) -> Numeric:
             return rows[place] if is_traced(k) else picked(rows, place)
@@ -110,7 +116,7 @@ class Solution(eqx.Module):
         # Without events there is no memory: an empty array, with the axes of a batch.
         t, x, none = cut(self.ts, (..., k)), cut(self.states, row), cut(self.states, (..., k, slice(0)))
         if not is_traced(x) and x.ndim == 1 and not np.isfinite(x).all():
-            raise ModelError(f"solution.at({int(k)}): the run did not get to t={float(t):g} ({self.result})")
+            raise ModelError(f"solution.at({k}): the run did not get to t={float(t):g} ({self.result})")
         of = self.system.plan.digest_of_states
         if self.discrete is None or self.memory is None:
             return SavedState(t, x, none, none, none, none, of)

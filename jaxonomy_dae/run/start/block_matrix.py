@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,32 +65,35 @@ class Block:
         """The numbers of equations and of unknowns."""
         return sum(map(len, self.equations)), len(self.unknown)
 
-    def _entries(self, of_slots: Callable[[QuantityGroup], np.ndarray]) -> np.ndarray:
-        inside, _ = self._places
-        return np.concatenate([of_slots(group)[at] for group, at in zip(self.equations, inside, strict=True)])
+    def _entries(self, numbers: Sequence[np.ndarray]) -> np.ndarray:
+        """Those of numbers by slots, (n, slots) of each group of equations, that belong to unknowns."""
+        return np.concatenate([found[at] for found, at in zip(numbers, self._places[0], strict=True)])
 
-    def matrix(self, of_slots: Callable[[QuantityGroup], np.ndarray]) -> Any:
-        """A sparse matrix from numbers by slots, (n, slots) of each group of equations."""
-        return sp.csr_array((self._entries(of_slots), self._places[1]), shape=self.shape)
+    def _sparse(self, numbers: Sequence[np.ndarray]) -> Any:
+        return sp.csr_array((self._entries(numbers), self._places[1]), shape=self.shape)
+
+    def _with_errors(self, known: Known) -> Iterator[tuple[np.ndarray, ...]]:
+        """The numbers by slots of the Jacobian, then bounds of their errors."""
+        found = [group.partials_with_errors(known.at, known.errors) for group in self.equations]
+        return zip(*found, strict=True)
 
     def jacobian(self, known: Known) -> Any:
         """∂(residuals)/∂(unknowns)."""
-        return self.matrix(lambda group: group.partials(known.at))
+        return self._sparse([group.partials(known.at) for group in self.equations])
 
     def is_evident(self, known: Known) -> bool:
         """True if the equations are independent at a glance, as `are_evident`."""
 
-        def dense(of_slots: Callable[[QuantityGroup], np.ndarray]) -> np.ndarray:
+        def dense(numbers: Sequence[np.ndarray]) -> np.ndarray:
             out = np.zeros((1, *self.shape))
-            np.add.at(out[0], self._places[1], self._entries(of_slots))
+            np.add.at(out[0], self._places[1], self._entries(numbers))
             return out
 
-        errors = dense(lambda group: group.partial_errors(known.at, known.errors))
-        return bool(are_evident(dense(lambda group: group.partials(known.at)), errors)[0])
+        return bool(are_evident(*map(dense, self._with_errors(known)))[0])
 
     def rank(self, known: Known) -> Rank | SparseRank | None:
         """The Jacobian's rank; None if it is not finite, which has another cause."""
-        matrix, errors = self.jacobian(known), self.matrix(lambda g: g.partial_errors(known.at, known.errors))
+        matrix, errors = map(self._sparse, self._with_errors(known))
         if not np.isfinite(matrix.data).all():
             return None
         if matrix.shape[0] > DECOMPOSED_UPTO:
@@ -128,7 +131,7 @@ class Block:
             u, v = left[rows], np.where(inside[..., None], right[place], 0.0)
             # Null vectors are those of the scaled matrix.
             scales = rank.r[rows, None] * rank.c[place]
-            errors = np.where(inside, group.partial_errors(at, known.errors) * scales, 0.0)
+            errors = np.where(inside, group.partials_with_errors(at, known.errors)[1] * scales, 0.0)
             noise += np.einsum("ia,is,isb->ab", np.abs(u), errors, np.abs(v))
             # An argument in one place of one equation is moved, and nothing that reads the same elsewhere.
             own = group.apart()

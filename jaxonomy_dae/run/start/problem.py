@@ -316,7 +316,8 @@ def frozen_inputs(inputs: Any) -> Any:
 
 def start_values(rows: tuple[StartRow | None, ...], given: list, parameters: Any) -> tuple[Any, Any]:
     """The values of start rows, shape (rows,): one vectorised kernel for each distinct start expression. And the sizes
-    of their terms, |value| + Σ |∂(value)/∂(parameter)|·|parameter|, which rounding is relative to: constants."""
+    of their terms, |value| + Σ |∂(value)/∂(parameter)|·|parameter|, which rounding is relative to: constants. Where a
+    slope is infinite, as that of a root at zero, it tells no size."""
     members: dict[str, list[int]] = {}
     for k, row in enumerate(rows):
         key = "zero" if row is None or (row.start is None and row.given < 0) else "given"
@@ -343,7 +344,8 @@ def start_values(rows: tuple[StartRow | None, ...], given: list, parameters: Any
             read = [_column(parameters, column) for column in columns]
             value, pull = jax.vjp(kernel, *read)
             slopes = pull(jnp.ones(shape, dtype))
-            size = sum((jnp.abs(s * v) for s, v in zip(slopes, read, strict=True)), jnp.abs(value))
+            terms = (jnp.where(jnp.isfinite(s), jnp.abs(s * v), 0) for s, v in zip(slopes, read, strict=True))
+            size = sum(terms, jnp.abs(value))
         parts.append(value)
         sizes.append(jax.lax.stop_gradient(size))
     if not parts:

@@ -6,7 +6,7 @@ that some Jacobian depends on are computed.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from ...base.tolerances import ILL_CONDITIONED, SLIGHT
 from ...compile.lowering.plan import SystemPlan
 from ...compile.lowering.remembered import remembered
 from ...compile.lowering.schedule import SparseStep, Step, StepEquation
-from ...compile.model.group import Point, QuantityGroup
+from ...compile.model.group import Point
 from ...compile.model.opaque import Networks
 from ...compile.model.tables import ZERO
 from ...compile.model.typical_sizes import typical_sizes
@@ -146,12 +146,11 @@ def examine_blocks(
     yield from _constraints(plan, known)
 
 
-def _in_blocks(step: Step, of_slots: Callable[[QuantityGroup], np.ndarray]) -> np.ndarray:
+def _in_blocks(step: Step, numbers: Sequence[np.ndarray]) -> np.ndarray:
     """Numbers by slots, (n, slots) of each of a step's equations, as matrices of its n blocks, shape (n, k, k)."""
     k = len(step.unknown)
     out = np.zeros((step.n, k, k))
-    for e, equation in enumerate(step.equations):
-        found = of_slots(equation)
+    for e, (equation, found) in enumerate(zip(step.equations, numbers, strict=True)):
         for slot in equation.inside:
             out[:, e, equation.local[slot]] += found[:, slot]
     return out
@@ -159,9 +158,8 @@ def _in_blocks(step: Step, of_slots: Callable[[QuantityGroup], np.ndarray]) -> n
 
 def _are_suspicious(step: Step, known: Known) -> np.ndarray:
     """True for blocks that are not evidently regular, shape (n,)."""
-    matrices = _in_blocks(step, lambda equation: equation.partials(known.at))
-    errors = _in_blocks(step, lambda equation: equation.partial_errors(known.at, known.errors))
-    return ~are_evident(matrices, errors)
+    found = [equation.partials_with_errors(known.at, known.errors) for equation in step.equations]
+    return ~are_evident(*(_in_blocks(step, numbers) for numbers in zip(*found, strict=True)))
 
 
 def _follow(step: Step, known: Known):
@@ -180,7 +178,7 @@ def _solve(step: Step, known: Known):
     residual = np.stack([equation.residual(known.at) for equation in step.equations], axis=-1)
     try:
         with np.errstate(all="ignore"):
-            matrices = _in_blocks(step, lambda equation: equation.partials(known.at))
+            matrices = _in_blocks(step, [equation.partials(known.at) for equation in step.equations])
             found = np.linalg.solve(matrices, -residual[..., None])[..., 0]
     except np.linalg.LinAlgError:
         found = np.full(residual.shape, np.nan)

@@ -22,7 +22,7 @@ class Mass:
                 "DAETerm(lambda t, x, z, args: z, lambda t, x, z, args: M(t, x) @ z - F(t, x, args))"
             )
         try:
-            array = np.asarray(matrix, float)
+            array = np.array(matrix, float)  # a copy: it is made read-only below
         except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
             raise ModelError(
                 "the mass matrix of a DAETerm is constant: it cannot be traced. Move what varies into F, or solve for "

@@ -352,4 +352,11 @@ def compressed(push: Callable[[Any], Any], pattern: SparsePattern, dtype: Any) -
     seeds = jnp.zeros((pattern.n_colors, pattern.n), dtype).at[colors, np.arange(pattern.n)].set(1.0)
     products = jax.vmap(push)(seeds)
     # No other column of the colour has an entry in this row, so the product there is the entry itself.
-    return products[colors[pattern.cols], pattern.rows]
+    found = products[colors[pattern.cols], pattern.rows]
+    if pattern.coalesced is None:
+        return found
+    # Values at one place add up, so that the first of them is the entry, and the others are zero.
+    _, place = pattern.coalesced
+    is_first = np.zeros(len(pattern), bool)
+    is_first[np.unique(place, return_index=True)[1]] = True
+    return jnp.where(is_first, found, 0)

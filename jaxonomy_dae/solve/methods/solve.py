@@ -112,6 +112,12 @@ def solve_dae(
         jumps = jump_times(jump_ts, dtype)
         longest = None if dtmax is None else jnp.asarray(dtmax, dtype)
         stepsize_controller = step_control(solver, rtol, atol, jumps, longest)
+    elif jump_ts is not None or dtmax is not None:
+        given = "dtmax" if jump_ts is None else "jump_ts"
+        raise ModelError(
+            f"{given} and stepsize_controller both say how long steps are: leave one out, or put {given} into the "
+            "controller (StepControl(..., dtmax=...), diffrax.ClipStepSizeController(..., jump_ts=...))"
+        )
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ModelError(BACKSOLVE)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
@@ -192,7 +198,12 @@ def default_tolerances(rtol: Tolerance, atol: Tolerance, dtype: DTypeLike) -> tu
 def check_tolerances(rtol: Tolerance, atol: Tolerance, dtype: DTypeLike):
     """Refuses tolerances that are not numbers or that the precision cannot reach."""
     for name, value in (("rtol", rtol), ("atol", atol)):
-        for leaf in jax.tree.leaves(value):
+        leaves = jax.tree.leaves(value)
+        if name == "rtol" and (len(leaves) != 1 or np.shape(leaves[0]) != ()):
+            raise ModelError(
+                f"rtol must be one number; got {value}. Where unknowns differ, give atol in the shape of y"
+            )
+        for leaf in leaves:
             if is_traced(leaf):
                 continue
             if isinstance(leaf, str):
