@@ -72,7 +72,7 @@ class Estimate:
 
     def __repr__(self):
         score = f", held out {self.holdout_score:.3g} σ" if self.objective.stacked.holdout.any() else ""
-        return f"Estimate({self.message}: χ² {self.chi2:.4g} of {self.freedom:.1f} degrees of freedom{score})"
+        return f"Estimate({self.message}: χ² {self.chi2:.4g} of {max(self.freedom, 0.0):.1f} degrees of freedom{score})"
 
     @functools.cached_property
     def reasons(self) -> tuple[str, ...]:
