@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from ..base.aliases import Args, Numeric, Time
+from ..base.errors import ModelError
 from ..base.tolerances import solved
 from ..compile.lowering.plan import SystemPlan
 from ..compile.model.declared import declared_scale
@@ -51,11 +52,17 @@ class RestingEvents:
 
 def resting_events(plan: SystemPlan, kept: Sequence[int] = (), drifting: Sequence[int] = ()) -> RestingEvents | None:
     """The events of a system, but for those that say what relations are: relations are as their sides say. `kept` are
-    the places of discrete values, `drifting` those of states, that stay as they start. None if there are no events."""
+    the places of discrete values, `drifting` those of states, that stay as they start. None if there are no events.
+
+    **Raises:**
+
+    - `ModelError` for discrete equations that read the ticks of a clock.
+    """
     events = plan.events
     if events is None:
         return None
     table = events.table
+    _check_ticks(plan, table.discrete[(table.event < events.n_clocks) & (table.discrete >= 0)])
     relation = table.are(EventFlag.RELATION)
     ignored = np.isin(table.discrete, list(kept)) & (table.discrete >= 0)
     ignored |= np.isin(events.state, list(drifting)) & (events.state >= 0)
@@ -75,6 +82,23 @@ def resting_events(plan: SystemPlan, kept: Sequence[int] = (), drifting: Sequenc
     # Hidden discrete values leave no choice: relations follow their sides.
     flips = _flips(np.unique(table.discrete[chooses]).tolist(), len(events.discrete))
     return RestingEvents(unknown, ticking, computed, acting, ignored, flips)
+
+
+def _check_ticks(plan: SystemPlan, ticking: np.ndarray):
+    """Raises an error for discrete equations that tell at which instants clocks tick: what they leave at rest is not
+    solved for. `ticking` are the discrete values that clocks write."""
+    events, names = plan.some_events, plan.flat.parameters.names
+    if not events.table.are(EventFlag.REPEATED).any():
+        return
+    every = {names[p] for p in events.discrete}
+    for name in sorted({names[events.discrete[k]] for k in ticking}):
+        owner, _, own = name.rpartition(".")
+        if own.startswith(":tick[") or f"{owner}.:pre({own})" in every:
+            what = "a clock" if own.startswith(":") else f"by '{name}' when a clock ticks"
+            raise ModelError(
+                f"the discrete equations of '{owner}' read {what}, and where they rest is not solved for: write "
+                "what is sampled as self.when(self.sampled(T), assign(…)), or let simulate run until nothing changes"
+            )
 
 
 def _flips(choices: list[int], n: int) -> np.ndarray:

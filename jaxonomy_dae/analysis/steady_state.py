@@ -78,7 +78,8 @@ def steady_state(
 
     **Raises:**
 
-    - `ModelError` for an unknown name, and a name in `drifting` that is neither a state nor a discrete variable.
+    - `ModelError` for an unknown name, for a name in `drifting` that is neither a state nor a discrete variable, and
+        for discrete equations that read the ticks of a clock.
     - `SteadyStateError` if no equilibrium was found; the text names the derivatives that do not vanish, or the event
         that keeps the system from rest. Also if the equilibrium is singular; the text names the undetermined states.
         Inside jit, these are Equinox run-time errors.

@@ -110,9 +110,18 @@ def law_of(estimate: "Estimate", name: str, grid: Any, law: Callable | None) -> 
     module = estimate.system.neural[name] if name in estimate.system.neural else estimate.observers[name]
     points = np.asarray(grid, float)
     block = block_of(estimate.system.plan, name)
+    if not points.ndim:
+        raise ModelError(f"a grid has shape (n,) or (n, inputs); got one number, {points:g}")
     if law is None:
         law = _first_output if block is None else _FirstOutput(block.opaque)
-        points = points if block is None or points.ndim > 1 else points[:, None]
+        if block is not None:
+            count = block.opaque.n_inputs
+            points = points[:, None] if points.ndim == count == 1 else points
+            if points.shape[1:] != (count,):
+                raise ModelError(
+                    f"'{name}' has {count} inputs, {', '.join(block.inputs[0])}: the grid is of shape (n, {count}); "
+                    f"got {points.shape}. For another quantity give law=, a function of the network and of a grid point"
+                )
     return module, law, jnp.asarray(points, objective.system.parameters.values.dtype)
 
 

@@ -86,7 +86,8 @@ def check_steps(s: Stacked) -> None:
 def steps_between(times: Float[np.ndarray, " n"]):
     """A function of row numbers, increasing: how many sampling steps lie between them. The step is the median one; gaps
     that are nearly whole numbers of it are whole."""
-    step = np.median(np.diff(times)) if len(times) > 1 else 1.0
+    steps = np.diff(times)[np.diff(times) > 0]  # a part of the record ends with times that repeat its last
+    step = np.median(steps) if len(steps) else 1.0
 
     def between(index: Int[np.ndarray, " r"]) -> Float[np.ndarray, " _"]:
         gaps = np.diff(times[index]) / step

@@ -179,6 +179,7 @@ def stack(
                     f"{label}: the noise of '{name}' has another distribution, correlation or shared level than before"
                 )
     outputs = _ordered(outputs, () if like is None else like.outputs)
+    _check_shared(outputs, noises)
     n = max(len(one.times) for one in experiments)
     shape = (len(experiments), n, len(outputs))
     values, levels, unit = np.full(shape, math.nan), np.full(shape, math.nan), np.ones(shape)
@@ -216,6 +217,17 @@ def stack(
         labels=tuple(data.labels),
         counts=tuple(len(one.times) for one in experiments),
     )
+
+
+def _check_shared(outputs: Iterable[str], noises: Mapping[str, Noise]) -> None:
+    """Refuses a shared level that has the name of an output with another one: the two would be one."""
+    for name in outputs:
+        shared = noises[name].shared
+        if shared in noises and noises[shared].shared != shared:
+            raise ModelError(
+                f"the noise of '{name}' shares the level '{shared}', which is the name of an output that does not: "
+                "give it another name, or that output the same Noise(shared=…)"
+            )
 
 
 def _ordered(found: Mapping[str, Entry], first: Iterable[str]) -> dict[str, Entry]:

@@ -233,7 +233,8 @@ class Experiment:
     @explained_keywords()
     def decimate(self, factor: int) -> "Experiment":
         """Every `factor`-th sample, after a low-pass filter without delay against aliasing. Known noise levels decrease
-        as for white noise.
+        as for white noise. Samples less than `factor` old ones away from an end are left out: there, the filter
+        would leave noise as it is.
 
         **Raises:**
 
@@ -242,8 +243,13 @@ class Experiment:
         """
         factor = whole_number(factor, "decimate: factor")
         steps = np.diff(self.times)
-        if len(steps) < factor or np.ptp(steps) > UNEVEN * steps.mean():
-            raise ModelError(f"decimate needs more than {factor} samples at even steps: resample(times) makes them so")
+        edge = factor if factor > 1 else 0
+        rows = np.arange(0, len(self.times), factor)
+        rows = rows[(rows >= edge) & (rows < len(self.times) - edge)]
+        if not len(rows) or len(steps) < 1 or np.ptp(steps) > UNEVEN * steps.mean():
+            raise ModelError(
+                f"decimate needs more than {2 * edge or 1} samples at even steps: resample(times) makes them"
+            )
         for name, values in self.data.items():
             if np.isnan(values).any():
                 raise ModelError(f"decimate: '{name}' has missing samples, over which no filter goes: window() a part")
@@ -252,9 +258,9 @@ class Experiment:
                 raise ModelError(f"decimate: {_of_neighbours(name)}")
         response = low_pass(factor) if factor > 1 else np.ones(1)
         quieter = float(np.linalg.norm(response))
-        data = self._each(lambda values: smoothed(values, response)[::factor])
-        sigma = {name: _rows(level, slice(None, None, factor), quieter) for name, level in self._noise.items()}
-        return self.changed(times=self.times[::factor], data=data, sigma=sigma)
+        data = self._each(lambda values: smoothed(values, response)[rows])
+        sigma = {name: _rows(level, rows, quieter) for name, level in self._noise.items()}
+        return self.changed(times=self.times[rows], data=data, sigma=sigma)
 
     @explained_keywords()
     def detrend(self, names: str | Sequence[str] | None = None, degree: int = 1) -> "Experiment":
@@ -424,7 +430,7 @@ def _seconds(column: Any) -> np.ndarray:
         try:
             stamps = np.array([np.datetime64(_without_zone(v), "us") for v in column])
         except (TypeError, ValueError) as error:
-            raise ModelError(f"times must be numbers or dates; got {column[0]!r}") from error
+            raise ModelError(f"times must be numbers or dates; got {next(iter(column))!r}") from error
         return (stamps - stamps[0]) / np.timedelta64(1, "s")
     return values.astype(float)
 

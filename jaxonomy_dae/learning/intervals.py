@@ -43,6 +43,11 @@ def profile(
     - `reach`: `reach(objective, start, weights)` is the minimum next to a start, with weights that stay as they are.
     """
     c = objective.coordinates
+    if c.shifts is not None and position in c.shifts.into:
+        raise ModelError(
+            f"profile: '{c.names[position]}' is a bias of a network, and is searched as the value at the centre of its "
+            "inputs: nothing can be said of it by itself. See fit.band for the law"
+        )
     allowed = 0.5 * float(scipy.stats.chi2.ppf(checked_level(level), 1))
     held = np.array(c.fixed)
     held[position] = True

@@ -178,7 +178,10 @@ class Problem:
 
     def _read(self, data: Data | Experiment, like: Stacked | None) -> Stacked:
         whole = data if isinstance(data, Data) else Data(data)
-        return stack(whole, self.system.plan, tuple(self.observers), self.starts, like)
+        stacked = stack(whole, self.system.plan, tuple(self.observers), self.starts, like)
+        if not stacked.observed[~stacked.holdout & (stacked.weight > 0)].any():
+            raise ModelError("nothing is to be fitted: what has samples is held out, or has the weight 0")
+        return stacked
 
     def layout_of(self, stacked: Stacked) -> Layout:
         """The names of arguments and results of a program for these data."""

@@ -225,7 +225,8 @@ def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSt
                 state.best, state.best_value, state.best_step = state.z, score, state.step
         if plan.callback is not None:
             score = state.scores[-1] if state.scores else float("nan")
-            if plan.callback(Update(state.step, loss, score, values_at(objective, state.z))) is True:
+            found = plan.callback(Update(state.step, loss, score, values_at(objective, state.z)))
+            if isinstance(found, bool | np.bool_) and found:  # a comparison of NumPy's numbers is no bool of Python
                 message, stopped = f"ended by the callback after {state.step} updates", True
         if plan.checkpoint is not None and writes and (due or stopped or state.step == plan.steps):
             counts = {"taken": len(state.history), "scored": len(state.scores), "rows": len(state.weights.row)}

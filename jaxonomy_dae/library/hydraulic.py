@@ -25,7 +25,7 @@ from ..write import (
     assign,
     der,
 )
-from .arguments import in_order, start_of
+from .arguments import in_order, start_of, yes_or_no
 
 DENSITY = 998.2  # kg/m³, water at 20 °C
 VISCOSITY = 1.002e-3  # Pa·s, water at 20 °C
@@ -229,15 +229,23 @@ class CheckValve(_TwoPort):
     While it is open, dp = p_crack + R·m_flow with m_flow ≥ 0; while it is shut, m_flow = 0 with dp ≤ p_crack. The
     cracking pressure `p_crack` in pascal and the resistance `R` in pascal second per kilogram are ≥ 0; both zero is the
     ideal valve. The discrete variable `active` is 1 while it is open. In series with an `Orifice`, flow is turbulent.
+
+    In series with an `Inertance` the flow is a state, which a shut valve holds at zero: write `inertial=True`. The
+    discrete variable is then `shut`, 0 at the start.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, p_crack: Value = 0.0, R: Value = 0.0, rho: Value = DENSITY):
+    def __init__(
+        self, ev: EqnEnv, name: str, p_crack: Value = 0.0, R: Value = 0.0, rho: Value = DENSITY, inertial: bool = False
+    ):
         super().__init__(ev, name)
         crack = self.parameter("p_crack", p_crack, unit="Pa", bounds=NONNEGATIVE)
         resistance = self.parameter("R", R, unit="Pa*s/kg", bounds=NONNEGATIVE)
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         dp, flow = self._two_ports()
-        self.complementary(crack + resistance * flow - dp, flow)
+        if yes_or_no(inertial, name, "inertial"):
+            self.complementary(flow, crack + resistance * flow - dp, "shut", order=1)
+        else:
+            self.complementary(crack + resistance * flow - dp, flow)
         self.declare_dissipation(dp * flow / density)
 
 

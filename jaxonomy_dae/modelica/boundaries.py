@@ -70,10 +70,11 @@ def flattened(
     name: str,
     changes: str = "",
     source: str | None = None,
-    records: Callable[[], Sequence[str]] = list,
+    records: Callable[[], Mapping[str, bool]] = dict,
 ) -> Closed:
     """Flattens a class, alone or, if its connectors ask for it, with boundaries. `records` names the overdetermined
-    records of its connectors: nothing else tells of those that no equation relates to others.
+    records of its connectors, and says whether the connector is conditional: nothing else tells of those that no
+    equation relates to others.
 
     **Raises:**
 
@@ -106,7 +107,7 @@ def flattened(
 
 
 def _alone(
-    front_end: FrontEnd, name: str, changes: str, source: str | None, records: Callable[[], Sequence[str]]
+    front_end: FrontEnd, name: str, changes: str, source: str | None, records: Callable[[], Mapping[str, bool]]
 ) -> tuple[Flattened, list[str]]:
     """The class by itself, and the overdetermined records that need a root outside."""
     extended = f"extends {name}({changes});" if changes else f"extends {name};"
@@ -126,10 +127,12 @@ def _alone(
             trees.append(error.record)
             continue
         except Unbalanced as error:
-            loose = [r for r in records() if r not in trees]
-            if not loose or error.missing != sum(kind.lacking for r in loose if (kind := _kind_of(r))):
+            loose = {r: conditional for r, conditional in records().items() if r not in trees}
+            there = [[r for r, conditional in loose.items() if not conditional], [*loose]]
+            chosen = next((rs for rs in there if rs and error.missing == sum(map(_lacking, rs))), None)
+            if chosen is None:
                 raise
-            trees += loose
+            trees += chosen
             continue
         wanting = [r for r in _believed(found.flat) if _kind_of(r) and r not in trees]
         if not wanting:
@@ -144,6 +147,12 @@ def _model(declared: Sequence[str], equations: Sequence[str]) -> str:
 
 def _kind_of(record: str) -> _Kind | None:
     return next((kind for kind in _KINDS if record.endswith(kind.ending)), None)
+
+
+def _lacking(record: str) -> int:
+    """How many equations a connector lacks whose record meets no boundary."""
+    kind = _kind_of(record)
+    return kind.lacking if kind else 0
 
 
 def _believed(flat: Json) -> Iterator[str]:

@@ -105,19 +105,19 @@ class Library:
                 self._names.find(name)  # says where its file is not Modelica, if that is the reason
             raise
 
-    def _records(self, name: str, source: str | None) -> list[str]:
-        """The overdetermined records of the connectors of a class of the library."""
+    def _records(self, name: str, source: str | None) -> dict[str, bool]:
+        """The overdetermined records of a class's connectors; true for those of conditional ones."""
         found = self._names.find(name) if source is None else None
         if not isinstance(found, Found):
-            return []
-        return [
-            f"{connector.name}.{record}"
+            return {}
+        return {
+            f"{connector.name}.{record}": "conditional" in connector.prefixes
             for connector, scopes in self._names.declarations(found)
             if not connector.dimensions
             and (of := self._names.class_of(connector.type, scopes)) is not None
             and of.source.kind == "connector"
             for record in self._overdetermined(of)
-        ]
+        }
 
     def _overdetermined(self, connector: Found) -> Iterator[str]:
         """The records of a connector whose type has a function `equalityConstraint`: they are overdetermined."""

@@ -51,7 +51,7 @@ class OpenComponent(FlatComponent):
         given = _given(of, parameters, where)
         missing = [n for n in of.required if n not in given]
         if missing:
-            least = ", ".join(f"{n}=…" for n in missing)
+            least = ", ".join(f"{n}=…" if n.isidentifier() else f'**{{"{n}": …}}' for n in missing)
             raise ModelError(
                 f"{where}: the class gives no value to {_listed(missing)}: {type(self).__name__}(…, {least})"
             )
@@ -88,12 +88,14 @@ class OpenComponent(FlatComponent):
         return super().variable(name, **declared)
 
     def _show_ports(self) -> None:
-        """Ports as attributes: also where a component has a method of that name; arrays of connectors as tuples."""
+        """Ports as attributes: also where a component has a method of that name; arrays of connectors as tuples. Those
+        of fluids are called `ports`, as the mapping of all ports, which stays."""
         nested: dict[str, Any] = {}
         for name, port in self.ports.items():
             nested.setdefault(name.partition("[")[0].partition(".")[0], []).append(port)
         for top, ports in nested.items():
-            object.__setattr__(self, top, ports[0] if ports[0].name == top else tuple(ports))
+            if top not in self.__dict__:
+                object.__setattr__(self, top, ports[0] if ports[0].name == top else tuple(ports))
 
 
 def _with_start(d: Declaration, start: Expression) -> Declaration:

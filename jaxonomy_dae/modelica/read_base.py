@@ -173,13 +173,14 @@ class Reader(ExpressionReader):
             name = self.name()
             dimensions = self._subscripts() + shared
             modifiers, value = self.modifiers(), self._value()
-            # Front ends obey the condition of a component when they flatten: it is passed over here.
+            whether: frozenset[str] = frozenset()
             if self.take("if"):
                 self.expression()
+                whether = frozenset({"conditional"})  # front ends obey the condition itself when they flatten
             self.pass_constraint()
             comment = self.comment()
             self.pass_annotation()
-            yield tree.Declaration(prefixes, kind, name, dimensions, modifiers, value, comment, line)
+            yield tree.Declaration(prefixes | whether, kind, name, dimensions, modifiers, value, comment, line)
         self.need(";")
 
     def file(self) -> tree.Class:

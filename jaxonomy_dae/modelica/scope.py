@@ -15,6 +15,7 @@ import sympy
 
 from ..base.errors import ModelError
 from ..graph.expressions.from_sympy import symbols_of
+from ..write.choices import exchanged
 from ..write.component import Component
 from ..write.discrete_equations import BEFORE, STARTED, DiscreteEquations
 from ..write.events import terminate
@@ -499,7 +500,7 @@ def previous(value: Value) -> Value:
     if not isinstance(value, sympy.Basic):
         return value
     found = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
-    return value.xreplace({s: DiscreteSymbol(f"{BEFORE}{n})") for s, n in found.items() if not n.startswith(":")})
+    return exchanged(value, {s: DiscreteSymbol(f"{BEFORE}{n})") for s, n in found.items() if not n.startswith(":")})
 
 
 def present(value: Value) -> Value:
@@ -507,6 +508,6 @@ def present(value: Value) -> Value:
     if not isinstance(value, sympy.Basic):
         return value
     names = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
-    return value.xreplace(
-        {s: DiscreteSymbol(n.removeprefix(BEFORE)[:-1]) for s, n in names.items() if n.startswith(BEFORE)}
+    return exchanged(
+        value, {s: DiscreteSymbol(n.removeprefix(BEFORE)[:-1]) for s, n in names.items() if n.startswith(BEFORE)}
     )

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import sympy
 
 from ..base.errors import ModelError
+from ..graph.expressions.smooth import Smooth
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
 from .continuous import equal, pairs, side_by_side
 from .definitions import assigned_in, with_entries
@@ -129,7 +130,8 @@ def _numerical(scope: Scope, value: Value) -> Value:
         if isinstance(s, ParameterSymbol):
             declared = scope.component.parameters[s.path].value
             values[s] = _numerical(scope, declared) if isinstance(declared, sympy.Basic) else declared
-    return value.subs(values) if value.free_symbols else value
+    found = value.subs(values) if value.free_symbols else value
+    return found.replace(Smooth, lambda inside: inside)  # a number has no kinks
 
 
 def _unwrapped(value: Value) -> Value:

@@ -13,6 +13,7 @@ import sympy
 
 from ..base.errors import ModelError
 from ..write.automatic_events import smooth
+from ..write.choices import by_conditions
 from .operations import RELATIONS
 from .values import Value, chosen, either
 
@@ -71,7 +72,7 @@ class Table:
         low, high = self._ends(pieces, x, y, u)
         branches = [(low, u < _plain(x[0]))]
         branches += [(p(u), u < _plain(x[k + 1])) for k, p in enumerate(pieces) if _is_wide(x[k + 1] - x[k])]
-        out = sympy.Piecewise(*branches, (high, True), evaluate=False)
+        out = by_conditions(*branches, (high, sympy.true))
         return out if events else smooth(out)
 
     def _ends(self, pieces: list[Callable], x: np.ndarray, y: np.ndarray, u: Value) -> tuple[Value, Value]:

@@ -181,8 +181,8 @@ Modifiers: TypeAlias = dict[str, Any]  # by name: an expression, modifiers, or t
 
 
 class Declaration(NamedTuple):
-    """A declared component: `prefixes` such as parameter or output, `type` and `name` as written, its `dimensions`, its
-    modifiers, and its binding `value`."""
+    """A declared component: `prefixes` such as parameter or output, and `conditional` for one with a condition, `type`
+    and `name` as written, its `dimensions`, its modifiers, and its binding `value`."""
 
     prefixes: frozenset[str]
     type: str

@@ -11,6 +11,7 @@ from sympy.logic.boolalg import Boolean
 
 from ..base.errors import ModelError
 from ..write.automatic_events import smooth
+from ..write.choices import by_conditions
 from ..write.truths import as_number as as_number
 from ..write.truths import both as both_hold
 from ..write.truths import either as one_holds
@@ -81,7 +82,7 @@ def chosen(condition: Value, a: Value, b: Value, quiet: bool = False) -> Value:
         return Record({k: chosen(condition, a[k], b[k], quiet) for k in a})
     if is_condition(a) and is_condition(b):
         return either(both(condition, a), both(negated(condition), b))
-    out = sympy.Piecewise((as_number(a), condition), (as_number(b), True), evaluate=False)
+    out = by_conditions((as_number(a), condition), (as_number(b), sympy.true))
     return smooth(out) if quiet else out
 
 

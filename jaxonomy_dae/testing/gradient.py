@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..base.aliases import PyTree
-from ..base.errors import ModelError
+from ..base.errors import ModelError, whole_number
 from ..solve.adjoint.stored_adjoint import forward_mode
 from .certificate import Certificate
 
@@ -53,6 +53,7 @@ def assert_gradient(
         derivatives are not finite.
     - `ModelError` inside jit, for an `at` without numbers, and for an `f` that cannot be differentiated forwards.
     """
+    directions = whole_number(directions, "assert_gradient: directions")
     at = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, at)
     moving, rest = eqx.partition(at, eqx.is_inexact_array)
     x, unravel = ravel_pytree(moving)

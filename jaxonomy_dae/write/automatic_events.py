@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import sympy
-from sympy.functions.elementary.piecewise import ExprCondPair
 
 from ..base.aliases import Condition, Expression
 from ..base.errors import ModelError
@@ -19,6 +18,7 @@ from ..graph.expressions.branches import ALWAYS, NEVER, Needed, union, within
 from ..graph.expressions.from_sympy import UnsupportedExpression, parts_of, symbols_of
 from ..graph.expressions.node import postorder
 from ..graph.expressions.smooth import Smooth
+from .choices import by_conditions
 from .events import LIVE, has_guard
 from .symbols import RelationSymbol, TimeSymbol, VariableSymbol
 from .timed_relations import Edges, edges_of, in_relations_of_time, relations_in, whole_edges
@@ -301,20 +301,6 @@ def _has_an_end(e: Expression) -> bool:
 
 
 Turn = Callable[[Any], Any]
-
-
-def by_conditions(*pairs: tuple[Any, Any]) -> Expression:
-    """A `Piecewise` with the pairs as they are, up to the first condition that always holds. SymPy multiplies out
-    branches that stand in conditions of others, exponentially many, even if it is not to evaluate anything."""
-    kept = []
-    for value, condition in pairs:
-        if condition != sympy.false:
-            kept.append(sympy.Tuple.__new__(ExprCondPair, sympy.sympify(value), sympy.sympify(condition)))
-        if condition == sympy.true:
-            break
-    if len(kept) == 1 and kept[0].cond == sympy.true:
-        return kept[0].expr
-    return sympy.Basic.__new__(sympy.Piecewise, *kept)
 
 
 def _larger(turn: Turn, _: Turn, *arguments: Expression) -> Expression:

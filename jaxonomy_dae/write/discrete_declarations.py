@@ -8,6 +8,7 @@ from sympy.logic.boolalg import Boolean
 from ..base.aliases import Expression
 from ..base.errors import ModelError
 from .automatic_events import ROUNDING
+from .choices import exchanged
 from .declarations import Parameter
 from .discrete_equations import DiscreteEquations
 from .events import Assign
@@ -109,7 +110,7 @@ class DiscreteDeclarations(RelationDeclarations):
         before: dict[sympy.Basic, sympy.Basic] = {s: found.before(s.path) for s in sorted(read, key=str)}
         for variable, value in equations.items():
             # Whole parts first: relations that contain them then compare variables.
-            jumps = found.kept.with_jumps_as_variables(value.xreplace(before))
+            jumps = found.kept.with_jumps_as_variables(exchanged(value, before))
             found.give(variable.path, as_number(found.kept.in_discrete(jumps)), always=True)
         others = (DiscreteSymbol(s.path) for s in sorted(read, key=str))
         found.remembered += [d for d in others if d not in equations]

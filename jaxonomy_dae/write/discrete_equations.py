@@ -24,6 +24,7 @@ import sympy
 from ..base.aliases import Condition, Expression
 from ..base.errors import ModelError
 from ..graph.expressions.to_sympy import shortened
+from .choices import by_conditions, exchanged
 from .events import NO_FLAG, Action, Assign, EventFlag, Reinit, Sampled, Terminate, pre
 from .kept_relations import Following, KeptRelations
 from .symbols import DiscreteSymbol, VariableSymbol
@@ -193,11 +194,11 @@ class DiscreteEquations:
         definitions |= self._hidden
         first = self.phase(AT_FIRST)
         replaced: dict[sympy.Basic, sympy.Basic] = {
-            self.before(s.path): sympy.Piecewise((as_number(v), first), (self.before(s.path), True), evaluate=False)
+            self.before(s.path): by_conditions((as_number(v), first), (self.before(s.path), sympy.true))
             for s, v in self.initially.items()
         }
         replaced |= new
-        definitions = {s: e.xreplace(replaced) for s, e in definitions.items()}
+        definitions = {s: exchanged(e, replaced) for s, e in definitions.items()}
         _check_order(definitions, {v: k.path for k, v in new.items()})
         for symbol, expression in definitions.items():
             self.component._hidden(symbol.path, expression)
@@ -239,7 +240,7 @@ class DiscreteEquations:
         ends = [(self.unshown(f":ends[{k}]", 0.0), text, when) for k, (when, text) in enumerate(self._ends)]
         actions += [Assign(done, as_number(when)) for done, _, when in ends]
         starts = [
-            Reinit(x, VariableSymbol(c._hidden(f":when:reinit[{x.path}]", _first(cases, x).xreplace(replaced))))
+            Reinit(x, VariableSymbol(c._hidden(f":when:reinit[{x.path}]", exchanged(_first(cases, x), replaced))))
             for x, cases in self._reinits.items()
         ]
         shown = " or ".join(dict.fromkeys(b.text for b in self._branches if b.text)) or "a tick"
@@ -292,7 +293,7 @@ def _first(cases: list[tuple[Condition, Truth]], otherwise: Expression) -> Expre
     """The value of the first case that acts."""
     value = otherwise
     for acts, result in reversed(cases):
-        value = sympy.Piecewise((as_number(result), acts), (value, True), evaluate=False)
+        value = by_conditions((as_number(result), acts), (value, sympy.true))
     return sympy.sympify(value)
 
 

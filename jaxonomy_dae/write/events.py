@@ -10,6 +10,7 @@ from sympy.logic.boolalg import BooleanAtom, BooleanFunction, to_nnf
 from ..base.aliases import Condition
 from ..base.errors import ModelError
 from ..graph.expressions.from_sympy import symbols_of
+from .choices import by_conditions
 from .declarations import Value
 from .symbols import (
     DiscreteSymbol,
@@ -256,8 +257,7 @@ def _moving_relations(condition: Condition) -> list[Condition]:
 
 def while_on(guard: sympy.Expr, condition: Condition) -> sympy.Expr:
     """A guard that is there only while a condition in discrete variables holds."""
-    # Unevaluated: SymPy would multiply out branches that stand in conditions (`automatic_events.by_conditions`).
-    return guard if condition is sympy.true else sympy.Piecewise((guard, condition), (1, True), evaluate=False)
+    return guard if condition is sympy.true else by_conditions((guard, condition), (1, sympy.true))
 
 
 def relation_in_discretes(mode: Condition, where: str) -> Condition:

@@ -13,6 +13,7 @@ from ..base.aliases import Condition, Expression
 from ..graph.expressions.from_sympy import symbols_of
 from ..graph.expressions.smooth import Smooth
 from .automatic_events import ROUNDING, varies
+from .choices import exchanged
 from .symbols import DiscreteSymbol, VariableSymbol
 from .truths import Truth, plain
 
@@ -41,7 +42,7 @@ class KeptRelations:
         if not isinstance(value, sympy.Basic):
             return value
         found = {r: self._form(r) for r in _outermost(value, _ORDER) if varies(r) and r not in self.quiet}
-        return plain(value.xreplace(found)) if found else value
+        return plain(exchanged(value, found)) if found else value
 
     def in_bodies(self, value: Truth) -> Truth:
         """A value in the body of a `when` with those of its relations replaced that others read, or that turn at times
@@ -49,14 +50,14 @@ class KeptRelations:
         if not isinstance(value, sympy.Basic):
             return value
         found = {r: self._form(r) for r in _outermost(value, _ORDER) if self._known(r) or _is_of_time(r)}
-        return plain(value.xreplace(found)) if found else value
+        return plain(exchanged(value, found)) if found else value
 
     def in_equations(self, expression: Expression) -> Expression:
         """An expression with relations that discrete equations read replaced by their kept truths."""
         if not self.forms:
             return expression
         found = {r: self._form(r) for r in expression.atoms(*_ORDER) if self._known(r)}
-        return expression.xreplace(found) if found else expression
+        return exchanged(expression, found) if found else expression
 
     def with_jumps_as_variables(self, value: Truth) -> Truth:
         """A value with whole parts of what changes in time as variables, whose equations have events as others have."""
@@ -65,7 +66,7 @@ class KeptRelations:
         for e in _outermost(value, _JUMPING):
             if e not in self.variables and varies(e):
                 self.variables[e] = self.component._as_variable(e)
-        return value.xreplace(self.variables)
+        return exchanged(value, self.variables)
 
     def _known(self, relation: Condition) -> bool:
         return relation in self.forms or sympy.Not(relation) in self.forms

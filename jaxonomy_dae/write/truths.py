@@ -5,6 +5,8 @@ from typing import Any, TypeAlias
 import sympy
 from sympy.logic.boolalg import Boolean, BooleanAtom
 
+from .choices import by_conditions
+
 Truth: TypeAlias = Any  # bool | Boolean
 
 
@@ -42,5 +44,5 @@ def as_number(value: Truth) -> Any:
         return int(value)
     # A symbol is a `Boolean` for SymPy, too; here it stands for a number.
     if isinstance(value, Boolean) and not isinstance(value, sympy.Symbol):
-        return sympy.Piecewise((1, value), (0, True), evaluate=False)
+        return by_conditions((1, value), (0, sympy.true))
     return value

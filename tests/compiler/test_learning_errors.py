@@ -1,5 +1,8 @@
 """What experiments and problems refuse, and with which words. Nothing is simulated."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,6 +24,7 @@ from jaxonomy_dae.learning import (
     Shooting,
     Unknown,
 )
+from jaxonomy_dae.learning.band import law_of
 from jaxonomy_dae.learning.evaluation import Evaluation
 from jaxonomy_dae.learning.intervals import checked_level
 from jaxonomy_dae.learning.table import Row, Table
@@ -106,6 +110,12 @@ def test_experiment(given, words):
             "'held' in experiment 0 and 'linear' in experiment 1",
         ),
         ([record(holdout=True)], {}, "every experiment is held out"),
+        ([record(weight=0.0)], dict(method=Filter({"tank.level": 0.1})), "nothing is to be fitted"),
+        (
+            [record({"tank.level": TIMES, "tank.outflow": TIMES}, sigma={"tank.level": Noise(shared="tank.outflow")})],
+            {},
+            "'tank.level' shares the level 'tank.outflow', which is the name of an output that does not",
+        ),
         ([record(name="a"), record(name="a")], {}, "two experiments are named 'a'"),
         ([record()], dict(train=["tank.kk"]), "'tank.kk' is neither a parameter, a network nor a sensor law"),
         ([record()], dict(train=[]), "nothing is to be learned"),
@@ -137,6 +147,7 @@ def test_problem(system, experiments, given, words):
         (dict(start={"tank.k": np.nan}), "'tank.k' needs a finite number"),
         (dict(bounds={"tank.k": (2.0, 1.0)}), r"bounds of 'tank.k' must lie within"),
         (dict(horizons=(0.5,)), "horizons are shares"),
+        (dict(data=record(weight=0.0)), "nothing is to be fitted"),
         (dict(steps=-1), "steps is a whole number ≥ 0; got -1"),
         (dict(data=record({"tank.outflow": TIMES})), "name other outputs"),
     ],
@@ -334,3 +345,14 @@ def test_the_prior_of_a_positive_number_of_an_experiment_is_normal():
     z = objective.coordinates.scaled(np.array([4.0]))
     found = Evaluation(np.zeros(3), np.zeros((3, 1)))
     assert objective.weights(z, found).prior(z).residual == pytest.approx([(4.0 - 1.0) / 2.0], rel=1e-12)
+
+
+def test_grids_of_bands(system):
+    """Bare errors of array shapes."""
+    fit: Any = SimpleNamespace(
+        objective=SimpleNamespace(layout=SimpleNamespace(modules=("tank.loss",))), system=system, observers={}
+    )
+    with pytest.raises(ModelError, match=r"'tank.loss' has 1 inputs, tank.level: .* shape \(n, 1\); got \(4, 2\)"):
+        law_of(fit, "tank.loss", np.ones((4, 2)), None)
+    with pytest.raises(ModelError, match="got one number, 0.5"):
+        law_of(fit, "tank.loss", 0.5, None)

@@ -138,6 +138,32 @@ def test_classes_that_do_not_open(library, name, told):
         library[name]
 
 
+def test_connectors_may_be_called_as_the_mapping_of_ports():
+    """Sources and tanks of fluids call their connectors `ports`."""
+    text = """
+package Lib
+  connector Pin Real v(unit = "V"); flow Real i(unit = "A"); end Pin;
+  model Bridge
+    parameter Real G = 2;
+    Pin ports[2];
+  equation
+    ports[1].i = G*(ports[1].v - ports[2].v);
+    ports[1].i + ports[2].i = 0;
+  end Bridge;
+end Lib;
+"""
+    ev, d = EqnEnv(), AcausalDiagram()
+    bridge = component("Lib.Bridge", source=text)(ev, "bridge")
+    v, g = electrical.VoltageSource(ev, "v", V=3.0), electrical.Ground(ev, "g")
+    d.add(bridge, v, g)
+    d.connect(v.p, bridge.ports["ports[1]"])
+    d.connect(v.n, g.p, bridge.ports["ports[2]"])
+    system = AcausalCompiler(ev, d)()
+    quantity, factor = system.plan.resolve(["bridge.ports[1].i"])
+    point = initial_point(system.plan.model, Declared(np.asarray(system.parameters.values), {}))
+    assert point.values[quantity] * factor == pytest.approx(6.0, rel=1e-14)
+
+
 def test_roots_that_do_not_exist():
     with pytest.raises(ModelError, match=r"roots: there is no '/nowhere/libraries'"):
         component("A", roots="/nowhere/libraries")

@@ -71,6 +71,7 @@ def wrong(*components, connect=()) -> list[str]:
         ("N*m", "J", 1), ("kg*m2/s2", "J", 1), ("kg/(m*s)", "Pa*s", 1), ("W/(m2*K)", "kg/(s3*K)", 1),
         ("1/(A*s)", "1/C", 1), ("V*s/rad", "N*m/A", 1), ("Ohm", "V/A", 1), ("m3/rad", "m3", 1), ("rad", "1", 1),
         ("kg m2 s-2", "J", 1), ("m²", "m2", 1), ("m^2", "m**2", 1), ("m/s/s", "m/s2", 1), ("Nm", "N*m", 1),
+        ("kNm", "N*m", 1000), ("Nms/rad", "N*m*s", 1), ("kOhm", "ohm", 1000),
         ("mm", "m", 1e-3), ("bar", "Pa", 1e5), ("A*h", "C", 3600), ("kWh", "J", 3.6e6), ("%", "1", 0.01),
         ("rev/min", "rad/s", np.pi / 30), ("deg", "rad", np.pi / 180), ("l/min", "m3/s", 1e-3 / 60), ("Hz", "1/s", 1),
         ("degC", "K", 1), ("W/degC", "W/K", 1),
@@ -89,7 +90,9 @@ def test_no_text_is_an_unknown_unit():
     assert read_unit("") is None
 
 
-@pytest.mark.parametrize("text", ["metres a second/", "foo", "-", "m/", "3*m", "dB", "V<", "kg*", "m3/2", "unknown"])
+@pytest.mark.parametrize(
+    "text", ["metres a second/", "foo", "-", "m/", "3*m", "dB", "V<", "kg*", "m3/2", "1e3*m", "unknown"]
+)
 def test_texts_that_are_no_units(text):
     with pytest.raises(UnknownUnit):
         read_unit(text)

@@ -120,6 +120,8 @@ def test_passivity_needs_to_know_the_inputs():
     for given in ({"weights": -1}, {"count": 0}):  # an active law passed: no set of weights was looked at
         with pytest.raises(ModelError, match="is a whole number"):
             assert_passive(lambda v: v, 1, **given)
+    with pytest.raises(ModelError, match="directions is a whole number ≥ 1; got 0"):
+        assert_gradient(lambda x: jnp.sum(x**2), jnp.ones(20), directions=0)
     plain = eqx.nn.MLP(2, 2, 8, 2, jnp.tanh, key=jax.random.key(0))
     with pytest.raises(AssertionError):
         assert_passive(plain, 2)

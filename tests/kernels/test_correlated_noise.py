@@ -13,7 +13,7 @@ import scipy.stats
 
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.learning import Noise, powers
-from jaxonomy_dae.learning.colour import Colour
+from jaxonomy_dae.learning.colour import Colour, steps_between
 from jaxonomy_dae.learning.data import Stacked
 from jaxonomy_dae.learning.discovery import criterion
 from jaxonomy_dae.learning.evaluation import Weights
@@ -117,3 +117,9 @@ def test_criteria_count_the_density_of_correlated_noise():
         covariance = sigma**2 * rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
         exact = -2 * scipy.stats.multivariate_normal.logpdf(errors, cov=covariance) + 3 * np.log(n)
         assert criterion(fitted, 3) == pytest.approx(exact - n * np.log(2 * np.pi), rel=1e-12)
+
+
+def test_steps_of_a_part_of_a_record():
+    """Over a tenth of the time, the times that are cut off repeat the last: the median step was zero."""
+    times = np.minimum(0.5 * np.arange(40), 2.0)
+    np.testing.assert_array_equal(steps_between(times)(np.array([0, 1, 3])), [1.0, 2.0])

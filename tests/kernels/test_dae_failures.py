@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from jaxonomy_dae import InitializationError, ModelError, SimulationError
+from jaxonomy_dae.solve.linear.sparse import SparsePattern
 from jaxonomy_dae.solve.methods.dae_term import FlatProblem
 from jaxonomy_dae.solve.methods.failures import explain_start, how_it_stopped, start_check
 from jaxonomy_dae.solve.methods.solve import _on_constraints
@@ -233,6 +234,15 @@ BAD = {
         lambda: DAETerm(minus, mass=np.array([1.0, np.nan])),
         SHAPE + "(2,) with entries that are not finite",
     ),
+    "complex mass": (lambda: DAETerm(minus, mass=np.array([1j])), "mass must be real; it is complex"),
+    "mass of rows of two lengths": (
+        lambda: DAETerm(minus, mass=[[1.0], [2.0, 3.0]]),
+        "mass must be a matrix of numbers (n, n), or its diagonal (n,); got [[1.0], [2.0, 3.0]]",
+    ),
+    "places that are no integers": (
+        lambda: SparsePattern(np.array([0.5]), np.array([0]), 1),
+        "rows must be integers; got float64",
+    ),
     "mass of another size": (
         lambda: solve_dae(DAETerm(minus, mass=np.ones(3)), 1.0, np.ones(2)),
         "mass has shape (3,), but y has 2 values: it must be (2, 2) or (2,)",
@@ -260,6 +270,10 @@ BAD = {
     ),
     "names": (lambda: solve_dae(TERM, 1.0, GOOD, names=["p"]), "names must name every unknown: 3 of them; got 1"),
     "negative rtol": (lambda: solve_dae(TERM, 1.0, GOOD, rtol=-1.0), "rtol must be a number ≥ 0; got -1.0"),
+    "complex": (
+        lambda: solve_dae(DAETerm(minus, mass=np.ones(1)), 1.0, np.array([1j])),
+        "y0 must be real: make the real and the imaginary parts unknowns of their own",
+    ),
     "rtol of each": (
         lambda: solve_dae(TERM, 1.0, GOOD, rtol=np.array([0.1, 0.1])),
         "rtol must be one number; got [0.1 0.1]. Where unknowns differ, give atol in the shape of y",

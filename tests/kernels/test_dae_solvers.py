@@ -64,6 +64,22 @@ def test_projection_keeps_hidden_constraints(solver):
     assert abs(float(found[2:4] @ found[2:4]) / 2 + 9.81 * float(found[1])) < 1e-2
 
 
+@pytest.mark.parametrize("kind", ["bdf", "projected"])
+def test_projections_that_move_are_told_the_time_of_a_run_backwards(kind):
+    """On the spiral (1 + t)·(cos t, sin t), from t = 2 back to 0."""
+
+    def onto_spiral(t, y, args):
+        return y / jnp.sqrt(y @ y) * (1 + t)
+
+    solver = BDF(projection=onto_spiral) if kind == "bdf" else Projected(diffrax.Tsit5(), onto_spiral)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: y / (1 + t) + jnp.array([-y[1], y[0]])), solver, 2.0, 0.0, None,
+        3 * jnp.array([np.cos(2.0), np.sin(2.0)]),
+        stepsize_controller=StepControl(1e-6, 1e-6, steered=kind == "bdf"),
+    )  # fmt: skip
+    np.testing.assert_allclose(solution.ys[-1], [1.0, 0.0], atol=1e-5)
+
+
 # --- published values ----------------------------------------------------------------------------------------------
 
 

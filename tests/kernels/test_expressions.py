@@ -321,3 +321,14 @@ def test_where_a_node_is_needed_does_not_depend_on_an_order():
     (c, no_c), (d, no_d) = ([(name, holds) for holds in (True, False)] for name in "cd")
     first = frozenset([frozenset([c, d]), frozenset([no_c, no_d])])
     assert union(first, frozenset([frozenset([c, no_d])])) == frozenset([frozenset([c]), frozenset([no_d])])
+
+
+def test_a_power_of_zero_has_a_slope_in_its_exponent():
+    """∂(x^p)/∂p = x^p·log x is zero at x = 0 for p > 0, and has no value for p < 0."""
+    kernel = Kernel([partial_derivative(graph(X**Y), "y")], ["x", "y"])
+    at = np.array([[0.0, 2.0], [2.0, 3.0], [0.0, -1.0]])
+    found = kernel(list(at.T), "numpy")[0]
+    np.testing.assert_allclose(found[:2], [0.0, 8 * np.log(2)], rtol=1e-15)
+    assert not np.isfinite(found[2])
+    slope = jax.grad(lambda v: kernel([v, 2.0])[0])
+    assert slope(0.0) == 0.0

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from problems import compiled
-from sympy import Abs, Eq, Max, Min
+from sympy import Abs, Eq, Max, Min, Ne, Piecewise
 
 import jaxonomy_dae.library.translational as tr
 from jaxonomy_dae import (
@@ -39,6 +39,19 @@ def one(build):
             build(self)
 
     return compiled(Built(EqnEnv(), "c"))
+
+
+def test_discrete_equations_that_read_a_clock_are_refused():
+    """It was said that there is no steady state. At x = u = 1 there is one."""
+
+    def build(self):
+        x, u, ticks = self.variable("x", start=0.2, fixed=True), self.discrete("u"), self.discrete("ticks")
+        self.add_equations(Eq(der(x), u - x))
+        self.when(self.sampled(0.1), assign(ticks, pre(ticks) + 1))
+        self.discrete_equation(u, Piecewise((pre(u) + 1 - x, Ne(ticks, pre(ticks))), (pre(u), True)))
+
+    with pytest.raises(ModelError, match="discrete equations of 'c' read by 'c.ticks' when a clock ticks"):
+        steady_state(one(build), drifting=["c.ticks"])
 
 
 def lag(c, drive):

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
-from problems import compiled
+from problems import compiled, component
 from sympy import exp, sin
 
-from jaxonomy_dae import Component, Eq, EqnEnv, assign, der, pre, reinit, simulate
+from jaxonomy_dae import Component, Eq, EqnEnv, SimulationError, assign, der, pre, reinit, simulate
 
 TIGHT = dict(rtol=1e-10, atol=1e-10)
 
@@ -136,3 +136,20 @@ def test_a_constraint_that_does_not_begin_does_nothing():
     joined = simulate(compiled(Beside(EqnEnv(), "c", False)), 0.6, **TIGHT)[["c.v", "c.u"]][-1]
     # (v + u)' = 2 − (v + u), whatever joins them.
     np.testing.assert_allclose(joined, (2 + (0.4 - 2) * np.exp(-0.6)) / 2, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_gap_that_no_impulse_closes_is_named_where_it_is():
+    """x = 1 − t²/2 is held at zero from t = 1/2 on. The run was said to stop at its last step before, of some pole."""
+
+    def write(self, ev):
+        x, v = self.variable("x", start=1.0, fixed=True), self.variable("v", start=0.0, fixed=True)
+        f, on = self.variable("f"), self.discrete("on")
+        self.add_equations(Eq(der(x), v), Eq(der(v), f - 1))
+        self.either(Eq(on, 1), x, f, order=2)
+        self.when(ev.t >= 0.5, assign(on, 1))
+
+    with pytest.raises(
+        SimulationError, match=r"t=0\.5: .* hold there: 'c: x = 0 while Eq\(on, 1\)', where it is 0\.875"
+    ):
+        simulate(compiled(component(write)), 1.0)

@@ -341,6 +341,34 @@ def test_a_dimmed_lamp_behind_a_thyristor_and_an_exponential_diode():
     compare(system, names, [3e-3, 325.0, 1e-9], "filament.T", known, 0.036)
 
 
+def test_a_check_valve_stops_the_water_of_a_long_pipe():
+    """Inertia carries the water beyond equal levels; where it would turn back, the valve shuts and holds the levels."""
+    ev = EqnEnv()
+    high, low = (hyd.Tank(ev, k, A=0.1, initial_level=h) for k, h in (("high", 2.0), ("low", 1.0)))
+    check, column = hyd.CheckValve(ev, "check", R=1e2, inertial=True), hyd.Inertance(ev, "column", 200.0, 5e-3, 0.0)
+    walls = hyd.TurbulentPipe(ev, "walls", D=0.08, L=20.0)
+    ends = (
+        (high.fluid, check.port_a), (check.port_b, column.port_a), (column.port_b, walls.port_a),
+        (walls.port_b, low.fluid),
+    )  # fmt: skip
+    system = compiled(high, low, check, column, walls, connect=ends)
+
+    def known(p):
+        length, wide, resistance = p
+
+        def slopes(t, y):
+            lost = root(lambda dp: through(dp, pipe(wide, 20.0)) - y[2], -1e6, 1e6)
+            pull = RHO * G * (y[0] - y[1]) - resistance * y[2] - lost
+            return [-y[2] / (RHO * 0.1), y[2] / (RHO * 0.1), pull * 5e-3 / length]
+
+        _, y = followed(slopes, [2.0, 1.0, 0.0], 0.0, 5.0)
+        t, y = followed(slopes, y, 5.0, 200.0, lambda t, y: y[2])
+        assert t < 100.0 and y[1] > 1.5
+        return y[1]
+
+    compare(system, ["column.L", "walls.D", "check.R"], [200.0, 0.08, 1e2], "low.level", known, 100.0)
+
+
 class Yoke(Component):
     """b.s = r·sin(a.phi): a scotch yoke."""
 

@@ -13,6 +13,7 @@ import pytest
 import scipy.integrate
 import scipy.optimize
 from device_library import standard_library
+from open_classes import opened, run_with_slopes
 
 from jaxonomy_dae import (
     AcausalCompiler,
@@ -22,7 +23,6 @@ from jaxonomy_dae import (
     EqnEnv,
     actual_stream,
     der,
-    simulate,
 )
 from jaxonomy_dae.library import electrical, rotational, thermal, translational
 from jaxonomy_dae.library.signal import Constant, Step
@@ -35,24 +35,6 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def library():
     return Library(standard_library())
-
-
-def opened(library, path):
-    return library[f"Modelica.{path}"]
-
-
-def run_with_slopes(system, values, ts, names, of, solver=None):
-    """The values of variables, and the derivatives of the sum of the last values of `of` by parameters: no two of these
-    depend on the same parameter."""
-
-    def run(values):
-        options = {"ts": jnp.asarray(ts), "rtol": 1e-9, "atol": 1e-11, "solver": solver}
-        solution = simulate(system.with_parameters(values), float(ts[-1]), **options)
-        found = {n: solution[n] for n in names}
-        return sum(found[n][-1] for n in of), found
-
-    (_, found), slopes = jax.jit(jax.value_and_grad(run, has_aux=True))(values)
-    return found, slopes
 
 
 def test_an_amplifier_with_a_transistor(library):

@@ -3,7 +3,7 @@
 from collections.abc import Hashable, Mapping
 
 from .functions import TABLE, apply
-from .node import ONE, ZERO, Node, leaf, linear, multiply, postorder, power, scale, select
+from .node import ONE, ZERO, Node, both, compare, leaf, linear, multiply, postorder, power, scale, select
 from .smooth import marked
 
 
@@ -51,7 +51,9 @@ def _slope(n: Node, inner: list[Node]) -> Node:
         if inner[0] is not ZERO:
             terms.append((1, multiply(exponent, power(base, linear([(1, exponent)], -1)), inner[0])))
         if inner[1] is not ZERO:
-            terms.append((1, multiply(n, apply("log", base), inner[1])))
+            # 0^p·log 0 is zero for p > 0, and no number as it stands.
+            vanishes = both(compare("equal", base, ZERO), compare("less", ZERO, exponent))
+            terms.append((1, multiply(select(vanishes, ZERO, multiply(n, apply("log", base))), inner[1])))
         return linear(terms)
     if operation not in TABLE:
         return ZERO  # conditions

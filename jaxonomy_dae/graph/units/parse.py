@@ -13,9 +13,11 @@ BASE = {
     "[luminosity]": "cd",
 }  # fmt: skip
 # Spellings that engineers use and Pint reads as something else, or not at all.
-SPELLINGS = {"Ohm": "ohm", "Nm": "N*m", "rev": "revolution", "var": "VA"}
+SPELLINGS = {"Ohm": "ohm", "Nm": "N*m", "Nms": "N*m*s", "rev": "revolution", "var": "VA"}
+PREFIXES = "pnumkMGT"  # that may stand before these: Pint's kNm is a thousand metres of yarn over a kilogram
 LEGAL = re.compile(r"[\w\s*/^().·%°²³¹⁰⁴-⁹⁻Ωµ-]+")
-EXPONENT = re.compile(r"(?<=[A-Za-zΩµ°])(-?\d+)")
+# The e of a number such as 1e3 is no unit, and has no exponent.
+EXPONENT = re.compile(r"(?<=[A-Za-zΩµ°])(?<!\d[eE])(-?\d+)")
 
 
 class UnknownUnit(ValueError):
@@ -41,7 +43,7 @@ def read_unit(text: str) -> Unit | None:
     registry = _registry()
     if not text:
         return None
-    spelled = re.sub(r"[A-Za-z]+", lambda word: SPELLINGS.get(word[0], word[0]), text)
+    spelled = re.sub(r"[A-Za-z]+", lambda word: _spelled(word[0]), text)
     why = "it cannot be read"
     if LEGAL.fullmatch(text):
         # As it stands first: a unit's own name may contain a digit, as cmH2O does.
@@ -54,6 +56,13 @@ def read_unit(text: str) -> Unit | None:
                 unknown = getattr(error, "unit_names", None)
                 why = f"'{unknown[0] if isinstance(unknown, tuple) else unknown}' is not known" if unknown else why
     raise UnknownUnit(why)
+
+
+def _spelled(word: str) -> str:
+    """A word of a unit as Pint spells it."""
+    if word[0] in PREFIXES and word[1:] in SPELLINGS:
+        return word[0] + SPELLINGS[word[1:]]
+    return SPELLINGS.get(word, word)
 
 
 def _linear(registry: Any, unit: Any, text: str) -> Unit:

@@ -5,6 +5,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ...base.errors import ModelError, explained_keywords, whole_number
@@ -156,12 +157,12 @@ class Monotone(eqx.Module):
                  outputs: Sizes = 1.0):  # fmt: skip
         in_size, out_size = whole_number(in_size, "Monotone: in_size"), whole_number(out_size, "Monotone: out_size")
         width, depth = whole_number(width, "Monotone: width"), whole_number(depth, "Monotone: depth")
-        directions = (increasing,) * in_size if isinstance(increasing, bool) else tuple(increasing)
-        if len(directions) != in_size or not all(isinstance(d, bool) for d in directions):
+        rises = np.asarray(increasing)
+        if rises.dtype != bool or rises.shape not in ((), (in_size,)):
             raise ModelError(
                 f"Monotone: increasing is True or False, or one for each of {in_size} inputs; got {increasing!r}"
             )
-        self.signs = tuple(1.0 if d else -1.0 for d in directions)
+        self.signs = tuple(np.where(np.broadcast_to(rises, (in_size,)), 1.0, -1.0).tolist())
         self.inputs = sizes(inputs, in_size, "Monotone: inputs")
         self.outputs = sizes(outputs, out_size, "Monotone: outputs")
         layers = [in_size, *[width] * depth, out_size]

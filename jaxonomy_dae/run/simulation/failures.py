@@ -117,9 +117,9 @@ def explain(solution: Solution, at: Stopped, x0: State, implicit: bool, max_even
     if others and not written and not system.is_constrained and system.plan.held is None:
         return singular_mode(system, first, (t, x), inputs) + _of_short_circuits(system)
     written = written or others
-    gap = _gap_at_event(solution, at) if written else ""
+    gap = _gap_at_event(solution, at)
     if gap:
-        return stopped + gap
+        return gap
     if written:
         return f"{stopped}an event gave {written} a value that is not finite" + (
             ", or it entered a mode whose constraint does not hold at that instant (its gap or speed is not zero), or "
@@ -199,16 +199,19 @@ def mode_at_start(system: AcausalSystem, inputs: Inputs, t0: Time, x0: State) ->
 
 def _gap_at_event(solution: Solution, at: Stopped) -> str:
     """Names the constraints of modes that the last event entered though they do not hold where it happened, and by how
-    much; "" if all of them hold or it is not known what was before."""
-    system, inputs, log, t = solution.system, solution.inputs, solution.event_log, float(at.t)
+    much; "" if all of them hold, if it is not known what was before, or if the run went on after it."""
+    system, inputs, log = solution.system, solution.inputs, solution.event_log
     held, n = system.plan.held, len(system.plan.nominal)
     last = 0 if log is None else int(log.count) - 1
     if held is None or log is None or not 0 <= last < len(log.before):
         return ""
-    x, q = log.before[last][:n], log.before[last][n:]
-    at_once = abs(float(log.ts[last]) - t) <= MOVED * float(resolution(at.t0, at.t1))
-    if not at_once or not np.isfinite(np.asarray(x)).all():
+    (x, q), after = (log.before[last][:n], log.before[last][n:]), log.after[last][n:]
+    t = float(log.ts[last])
+    # A state that is not finite is no last point of a run, so that this may be one before the event.
+    goes_on = t < float(at.t) - MOVED * float(resolution(at.t0, at.t1))
+    if goes_on or not np.isfinite(np.asarray(x)).all():
         return ""
+    system = system.holding(after)
     begun = np.asarray(system.at(t, inputs).held(x)[0]) > np.asarray(system.holding(q).at(t, inputs).held(x)[0])
     levels = np.asarray(system.at(t, inputs).held(x)[1])
     gaps = {k: float(levels[held.table.owner == k][0]) for k in np.flatnonzero(begun).tolist()}
@@ -217,9 +220,9 @@ def _gap_at_event(solution: Solution, at: Stopped) -> str:
     if not lines:
         return ""
     return (
-        f"'{solution.events.names[-1]}' began a mode whose constraint does not hold there: {some(lines)}. No impulse "
-        "closes a gap. Let the mode begin where the constraint holds, with that as the event's condition, or write the "
-        "states with reinit(...)"
+        f"the integration stopped at t={t:g}: '{solution.events.names[-1]}' began a mode whose constraint does not "
+        f"hold there: {some(lines)}. No impulse closes a gap. Let the mode begin where the constraint holds, with that "
+        "as the event's condition, or write the states with reinit(...)"
     )
 
 

@@ -22,12 +22,17 @@ class Mass:
                 "DAETerm(lambda t, x, z, args: z, lambda t, x, z, args: M(t, x) @ z - F(t, x, args))"
             )
         try:
-            array = np.array(matrix, float)  # a copy: it is made read-only below
+            # A copy: it is made read-only below.
+            array = np.array(matrix, complex if np.iscomplexobj(matrix) else float)
         except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
             raise ModelError(
                 "the mass matrix of a DAETerm is constant: it cannot be traced. Move what varies into F, or solve for "
                 "other variables"
             ) from None
+        except (TypeError, ValueError):
+            raise ModelError(f"mass must be a matrix of numbers (n, n), or its diagonal (n,); got {matrix!r}") from None
+        if np.iscomplexobj(array):
+            raise ModelError("mass must be real; it is complex")
         # A matrix that is diagonal is kept as such: products are cheaper, and sparse steps need it.
         if array.ndim == 2 and array.shape[0] == array.shape[1] and not (array - np.diag(np.diag(array))).any():
             array = np.diag(array).copy()

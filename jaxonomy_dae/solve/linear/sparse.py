@@ -49,6 +49,10 @@ class SparsePattern:
     """
 
     def __init__(self, rows: np.ndarray, cols: np.ndarray, n: int, n_rows: int | None = None):
+        for name, places in (("rows", rows), ("cols", cols)):
+            # Numbers with fractions would be cut off to whole ones without a word.
+            if np.size(places) and np.asarray(places).dtype.kind not in "iu":
+                raise ModelError(f"{name} must be integers; got {np.asarray(places).dtype}")
         self.rows = np.array(rows, np.int32)
         self.cols = np.array(cols, np.int32)
         self.n = int(n)

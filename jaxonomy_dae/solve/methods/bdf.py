@@ -157,11 +157,11 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
             t1 - t0,
             linear.empty(y.shape[0], y.dtype),
             jnp.zeros((2,), jnp.int32),
-            self._measured(t0, y0, args),
+            self._measured(problem, t0, y0),
         )
 
-    def _measured(self, t, y, args):
-        return None if self.guard is None else self.guard.measure(t, y, args)
+    def _measured(self, problem, t, y):
+        return None if self.guard is None else self.guard.measure(t * problem.direction, y, problem.args)
 
     def _fresh(self, y, slope, h, factor, counts, largest) -> _History:
         """The history of order 1 with one derivative known."""
@@ -189,7 +189,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
                 # Differences from before a jump predict nothing behind it, so the history begins anew with order 1.
                 moved, _ = consistent_point(problem, self.linear_solver, t0, y)  # algebraic unknowns jump too
                 slope = consistent_slope(problem, self.linear_solver, t0, moved)
-                largest = self._measured(t0, problem.unravel(moved), args)
+                largest = self._measured(problem, t0, problem.unravel(moved))
                 return moved, self._fresh(moved, slope, h, state.factor, state.counts, largest)
 
             y, state = jax.lax.cond(made_jump, restart, lambda: (y, state))
@@ -214,12 +214,12 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         if self.projection is not None:
             # Inside the step rather than around the solver, as for other methods: the projected value enters the
             # history. Differences of values beside the constraints would lead off them.
-            moved = ravel_like(self.projection(t1, problem.unravel(y1), args))
+            moved = ravel_like(self.projection(t1 * problem.direction, problem.unravel(y1), args))
             y1 = jnp.where(solved.converged, moved, y1)
         e = y1 - predicted
         allowed, largest, result = True, state.largest, diffrax.RESULTS.successful
         if self.guard is not None:
-            verdict = self.guard.judge(largest, t1, problem.unravel(y1), args)
+            verdict = self.guard.judge(largest, t1 * problem.direction, problem.unravel(y1), args)
             allowed, largest, result = verdict.allowed, verdict.largest, verdict.result(result)
 
         still = jax.lax.stop_gradient

@@ -10,6 +10,7 @@ from diffrax import AbstractWrappedSolver as _Wrapped
 
 from ...base.aliases import Args, Numeric, State, Time
 from ...base.errors import ModelError
+from ...base.private_names import unwrapped
 from .choice_guard import ChoiceGuard
 from .wrapped import WrappedSolver
 
@@ -56,7 +57,9 @@ class Projected(WrappedSolver):
 
     def init(self, terms, t0, t1, y0, args):
         state = self.solver.init(terms, t0, t1, y0, args)
-        return state if self.guard is None else (state, self.guard.measure(t0, y0, args))
+        if self.guard is None:
+            return state
+        return state, self.guard.measure(t0 * unwrapped(terms)[1], y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         if self.projection is None:
@@ -67,7 +70,9 @@ class Projected(WrappedSolver):
         y1, y_error, dense_info, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump
         )
-        projected = self.projection(t1, y1, args)
+        # A run backwards goes forwards in −t.
+        _, direction = unwrapped(terms)
+        projected = self.projection(t1 * direction, y1, args)
         # To the error that the solver estimates, since either alone may be small: a step onto another branch has a
         # small error and a long way back.
         if self.strict and y_error is not None:
@@ -76,8 +81,8 @@ class Projected(WrappedSolver):
         if self.guard is not None:
             if made_jump is not False:
                 # Behind a jump the state may be on another branch, where the determinant has another size and sign.
-                largest = jnp.where(made_jump, self.guard.measure(t0, y0, args), largest)
-            verdict = self.guard.judge(largest, t1, projected, args)
+                largest = jnp.where(made_jump, self.guard.measure(t0 * direction, y0, args), largest)
+            verdict = self.guard.judge(largest, t1 * direction, projected, args)
             if y_error is not None:
                 y_error = jax.tree.map(lambda e: jnp.where(verdict.allowed, e, jnp.inf), y_error)
             solver_state, result = (solver_state, verdict.largest), verdict.result(result)

@@ -93,6 +93,8 @@ def solve_dae(
     """
     y0 = jax.tree.map(_inexact, y0)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
+    if jnp.issubdtype(dtype, jnp.complexfloating):
+        raise ModelError("y0 must be real: make the real and the imaginary parts unknowns of their own")
     ts = ts if ts is None or hasattr(ts, "ndim") else as_array(ts)
     if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
         raise ModelError(f"max_steps must be a positive integer that is known beforehand; got {max_steps!r}")
