@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 from ..base.errors import ModelError
@@ -62,7 +62,8 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
         if d.value is not None and is_discrete(d.name)
     ]
     given = by_when | {n for section in algorithms for n in with_entries(assigned_in(section), model)}
-    candidates = [(s, _definable(s, is_discrete, given)) for s in [*others, *bindings]]
+    types = {d.name: d.type for d in model.declarations}
+    candidates = [(s, _definable(s, is_discrete, given, types)) for s in [*others, *bindings]]
     equations: list[tree.Statement] = [s for s, sides in candidates if not sides]
     matched, left = _matched([(s, sides) for s, sides in candidates if sides], is_discrete)
     of: dict[str, tree.Expression | int] = {**matched}
@@ -152,17 +153,18 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
 
 
 def _definable(
-    s: tree.Statement, is_discrete: Callable[[str], bool], given: set[str]
+    s: tree.Statement, is_discrete: Callable[[str], bool], given: set[str], types: Mapping[str, str]
 ) -> list[tuple[str, tree.Expression]]:
     """The variables that an equation can determine, each with its value; `given` are those that whens and algorithms
-    determine."""
+    determine. A Real variable determines no Integer one, as in y = u of a block with an Integer input."""
     if not isinstance(s, tree.Equality):
         return []
     out = []
     for side, other in ((s.left, s.right), (s.right, s.left)):
         if isinstance(side, tree.Reference):
             name = _name(side)
-            if is_discrete(name) and name not in given:
+            real = isinstance(other, tree.Reference) and types.get(_name(other)) == "Real"
+            if is_discrete(name) and name not in given and not (real and types.get(name) in ("Integer", "Boolean")):
                 out.append((name, other))
     return out
 

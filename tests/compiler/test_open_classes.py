@@ -164,6 +164,20 @@ end Lib;
     assert point.values[quantity] * factor == pytest.approx(6.0, rel=1e-14)
 
 
+def test_a_real_variable_does_not_determine_an_integer_input():
+    """y = u of a block from Integer to Real: u was taken for what y is, and no equation was left."""
+    text = """
+package Lib
+  connector IntegerInput = input Integer;
+  connector RealOutput = output Real;
+  block Converted IntegerInput u; RealOutput y; equation y = u; end Converted;
+end Lib;
+"""
+    x = component("Lib.Converted", source=text)(EqnEnv(), "x")
+    assert x.opened.inputs == ("u",) and "u" in x.variables
+    assert any("y" in map(str, e.free_symbols) for e in x.equations)
+
+
 def test_roots_that_do_not_exist():
     with pytest.raises(ModelError, match=r"roots: there is no '/nowhere/libraries'"):
         component("A", roots="/nowhere/libraries")
