@@ -4,6 +4,9 @@ Each stands in a plant with our own parts, beside its equations in SciPy; slopes
 `MODELICA_LIBRARY` names the folder of the library; without it the tests are skipped.
 """
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
@@ -11,7 +14,7 @@ import scipy.optimize
 from device_library import standard_library
 from open_classes import by_differences, opened, run_with_slopes
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, Rotational, der, simulate
 from jaxonomy_dae.library import electrical, rotational, thermal, translational
 from jaxonomy_dae.library.signal import Constant
 from jaxonomy_dae.modelica import Library
@@ -180,6 +183,78 @@ def test_a_spherical_pendulum_and_a_body_in_flight(library):
     np.testing.assert_allclose([found[n] for n in names], reference(*values.values()), atol=1e-7)
     for name, expected in by_differences(reference, values).items():
         assert slopes[name] == pytest.approx(expected, rel=1e-5), name
+
+
+class Motor(Component):
+    """A network of the angle and the speed is the torque on a flange."""
+
+    def __init__(self, ev: EqnEnv, name: str, network):
+        super().__init__(ev, name)
+        a = self.port("flange", Rotational)
+        speed = self.variable("w")
+        (torque,) = self.learned("law", network, [a.phi, speed])
+        self.add_equations(Eq(speed, der(a.phi)), Eq(a.tau, -torque))
+
+
+def test_a_double_pendulum_with_a_network_in_its_joint(library):
+    """A network turns the first joint of two links. The equations of Lagrange with its weights, by SciPy; the
+    derivative along a direction of its weights by differences."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    world = library.component(f"Modelica.{BODIES}.World", enableAnimation=False)(ev, "world")
+    Driven = library.component(f"Modelica.{BODIES}.Joints.Revolute", useAxisFlange=True)
+    first = Driven(ev, "first", start={"phi": 0.3, "w": 0.2})
+    second = opened(library, f"{BODIES}.Joints.Revolute")(ev, "second", start={"phi": 0.5, "w": 0.0})
+    link = opened(library, f"{BODIES}.Parts.FixedTranslation")(ev, "link", r=[0.7, 0.0, 0.0])
+    Body = opened(library, f"{BODIES}.Parts.Body")
+    upper = Body(ev, "upper", m=1.2, r_CM=[0.3, 0.0, 0.0], I_33=0.05)
+    lower = Body(ev, "lower", m=0.8, r_CM=[0.4, 0.0, 0.0], I_33=0.02)
+    network = eqx.nn.MLP(2, 1, 6, 1, activation=jnp.tanh, key=jax.random.key(0))
+    motor = Motor(ev, "motor", network)
+    d.add(world, first, second, link, upper, lower, motor)
+    d.connect(world.frame_b, first.frame_a)
+    d.connect(first.frame_b, link.frame_a, upper.frame_a)
+    d.connect(link.frame_b, second.frame_a)
+    d.connect(second.frame_b, lower.frame_a)
+    d.connect(first.axis, motor.flange)
+    wanted = ["first.phi", "first.w", "second.phi", "second.w"]
+    system = AcausalCompiler(ev, d, state_selection="dummy_derivatives", prefer_states=wanted)()
+    assert system.states == wanted
+    weights, rest = eqx.partition(network, eqx.is_array)
+    ts = np.array([0.4, 0.8, 1.2])
+    towards = jax.tree.map(lambda w: jnp.cos(jnp.arange(w.size, dtype=float)).reshape(w.shape), weights)
+
+    def moved(step):
+        return jax.tree.map(lambda w, v: w + step * v, weights, towards)
+
+    def run(step):
+        moving = eqx.tree_at(lambda s: s.neural["motor.law"], system, eqx.combine(moved(step), rest))
+        solution = simulate(moving, 1.2, ts=jnp.asarray(ts), rtol=1e-9, atol=1e-11)
+        found = jnp.stack([solution["first.phi"], solution["second.phi"]])
+        return found[:, -1].sum(), found
+
+    (_, found), by_weights = jax.jit(jax.value_and_grad(run, has_aux=True))(0.0)
+
+    def swing(step):
+        matrices = [(np.asarray(layer.weight), np.asarray(layer.bias)) for layer in moved(step).layers]
+        a, b, c = 0.05 + 1.2 * 0.09 + 0.8 * 0.49, 0.8 * 0.7 * 0.4, 0.02 + 0.8 * 0.16
+
+        def slope(t, x):
+            (one, two), (v, w) = x[:2], x[2:]
+            (A, p), (B, q) = matrices
+            torque = (B @ np.tanh(A @ np.array([one, v]) + p) + q)[0]
+            sin, cos = np.sin(two - one), np.cos(two - one)
+            right = [
+                torque + b * sin * w**2 - (1.2 * 0.3 + 0.8 * 0.7) * G * np.cos(one),
+                -b * sin * v**2 - 0.8 * 0.4 * G * np.cos(two),
+            ]
+            return [v, w, *np.linalg.solve([[a, b * cos], [b * cos, c]], right)]
+
+        run = solved(slope, [0.3, 0.8, 0.2, 0.2], ts)
+        return np.array([run[0], run[1] - run[0]])
+
+    np.testing.assert_allclose(found, swing(0.0), atol=1e-7)
+    expected = (swing(1e-4) - swing(-1e-4))[:, -1].sum() / 2e-4
+    assert float(by_weights) == pytest.approx(expected, rel=1e-5)
 
 
 WATER = "redeclare package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater"
