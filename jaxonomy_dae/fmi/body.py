@@ -16,7 +16,6 @@ from .c_types import c_type, number
 from .elementwise import ELEMENTWISE, Cell
 from .straight import (
     CALLS,
-    TABLE,
     Atom,
     Constant,
     Kind,
@@ -145,6 +144,16 @@ class Body:
         else:
             self._declare(name, kind, None)
         return Value(name, kind)
+
+    @contextlib.contextmanager
+    def lent(self, kind: Kind) -> Iterator[Value]:
+        """An array whose place is free again afterwards."""
+        size = -(-max(kind.size, 1) * np.dtype(kind.dtype).itemsize // ALIGNED) * ALIGNED
+        name, offset, t = self.name(), self._room(size), c_type(kind.dtype)
+        self._declared[name] = 2
+        self.line(f"{t} *const {name} = ({t} *)(void *)(w + {offset});")
+        yield Value(name, kind)
+        self._free.append((size, offset))
 
     def _declare(self, name: str, kind: Kind, owner: int | None) -> None:
         size = max(kind.size, 1) * np.dtype(kind.dtype).itemsize
@@ -473,8 +482,8 @@ class Body:
 
     def apply(self, program: Any, closed: Sequence[Any], given: Sequence[Value], results: Sequence[Value]) -> None:
         """Calls a program with what it closes over and values. What it closes over is part of what is called, and so
-        are integers that are known."""
-        values = [*map(known, closed), *map(_known_integers, given)]
+        are arrays and integers that are known: code that is made for them is shorter than code for any."""
+        values = [*map(known, closed), *map(_part_of_what_is_called, given)]
         passed = [v.text for v, value in zip(given, values[len(closed) :], strict=True) if value is None]
         self.call(self.source.inner(program, values), passed, [v.pointer for v in results])
 
@@ -483,9 +492,10 @@ class Body:
         self.apply(program.jaxpr, program.consts, given, results)
 
 
-def _known_integers(value: Value) -> Constant | None:
+def _part_of_what_is_called(value: Value) -> Constant | None:
+    """What is known of a value: nothing of numbers of floating point, with others of which a function may be called."""
     found = value.known
-    return None if found is None or found.dtype.kind not in "iub" or found.size > TABLE else Constant(found)
+    return None if found is None or (not found.ndim and found.dtype.kind == "f") else Constant(found)
 
 
 def _repeated(i: str, own: Sequence[int], shape: Sequence[int]) -> str:

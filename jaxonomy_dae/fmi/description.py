@@ -52,10 +52,11 @@ class Structure:
 
 def structured(name: str) -> str:
     """A name as the naming convention `structured` writes it: der(m.x,2) for a second derivative, and with a quoted
-    part where it has letters that identifiers have not."""
+    part where it has letters that identifiers have not: 'm_u00fc.x' for mü.x."""
     order, inner = inner_name(name)
     if not STRUCTURED.fullmatch(inner):
-        legal = re.sub(r"[^A-Za-z0-9_!#$%&()*+,\-./:;<>=?@\[\]^{}|~ ]", "_", inner)
+        # The convention knows ASCII alone. Each other letter has its own number, so that two names stay two.
+        legal = re.sub(r"[^A-Za-z0-9_!#$%&()*+,\-./:;<>=?@\[\]^{}|~ ]", lambda found: f"_u{ord(found[0]):04x}", inner)
         inner = f"'{legal}'"
     return inner if not order else f"der({inner})" if order == 1 else f"der({inner},{order})"
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import math
 import os
 import re
 import zipfile
@@ -92,6 +93,12 @@ def export_fmu(
         raise ModelError("arrays: FMI 2 has none: leave out fmi=2, or arrays=True")
     if dae and fmi != 3:
         raise ModelError("dae: the layered standard FMI-LS-DAE is one of FMI 3: leave out fmi=2, or dae=True")
+    if isinstance(kinds, str):
+        raise ModelError(f"kinds is a list of names; write kinds=[{kinds!r}]")
+    if not 0 < tolerance < 1:
+        raise ModelError(f"tolerance is a number between 0 and 1, as 1e-6; got {tolerance!r}")
+    if not 0 < stop_time < math.inf:
+        raise ModelError(f"stop_time is a positive number of seconds; got {stop_time!r}")
     known = TARGETS if fmi == 3 else FOLDERS_OF_FMI_2
     chosen = list(known) if platforms == "all" else [platforms] if isinstance(platforms, str) else platforms
     commands = {}

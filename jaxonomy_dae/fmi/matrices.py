@@ -4,12 +4,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..base.errors import ModelError
 from .c_types import c_type
 from .emitters import Emit, Params, affine, copy, emits
 from .straight import Kind
 from .writer import Value, Writer
 
 OPERATIONS: dict[str, Emit] = {}
+# Unknowns of a sparse system that C code solves for. It eliminates in a full matrix, of 2 MB for so many, and passes by
+# the zeros below the diagonal.
+FULL_UPTO = 500
 
 
 def _matrices(value: Value) -> tuple[int, int, int]:
@@ -53,6 +57,32 @@ def _triangular_solve(body: Writer, params: Params, given: Sequence[Value], resu
             f"{affine(i, n * m, 0)}, {size}, {other}, {step}, {skip}, {int(lower)}, {int(turned)}, "
             f"{int(bool(params['unit_diagonal']))});"
         )
+
+
+@emits(OPERATIONS, "solve_f64")
+def _sparse_solve(body: Writer, params: Params, given: Sequence[Value], results: Sequence[Value]) -> None:
+    """A·x = b of klujax, for which KLU is not at hand: x and b have the shape (systems, unknowns, right-hand sides)."""
+    (rows, columns, values, b), (out,) = given, results
+    count, n, m = _matrices(out)
+    entries = rows.kind.size
+    if n > FULL_UPTO:
+        raise ModelError(
+            f"the model has {n} simultaneous equations, and C code solves up to {FULL_UPTO} at once: a variable that "
+            "changes with time between them, as a small capacity, takes them apart"
+        )
+    with body.lent(Kind((n, n), out.kind.dtype)) as matrix, body.lent(Kind((2 * n,), np.dtype(np.int32))) as order:
+        with body.loops((count,)) as (i,):
+            body.line(f"memset({matrix.text}, 0, {n * n} * sizeof *{matrix.text});")
+            with body.loops((entries,)) as (k,):
+                place = f"{rows.at(k)} * {n} + {columns.at(k)}"
+                body.line(f"{matrix.at(place)} += {values.at(affine(i, entries, 0) + f' + {k}')};")
+            body.line(f"jx_lu_d({matrix.text}, {order.text}, {order.text} + {n}, {n}, {n});")
+            begin = affine(i, n * m, 0)
+            with body.loops((n, m)) as (j, c):
+                source = f"{begin} + {order.at(f'{n} + {j}')} * {m} + {c}"
+                body.line(f"{out.at(f'{begin} + {j} * {m} + {c}')} = {b.at(source)};")
+            body.line(f"jx_triangular_d({matrix.text}, {out.text} + {begin}, {n}, {m}, {m}, 1, 1, 0, 1);")
+            body.line(f"jx_triangular_d({matrix.text}, {out.text} + {begin}, {n}, {m}, {m}, 1, 0, 0, 0);")
 
 
 @emits(OPERATIONS, "cholesky")

@@ -50,5 +50,9 @@ class Writer(Protocol):
         """An array, or a scalar that can be assigned, for use on the way."""
         ...
 
+    def lent(self, kind: Kind) -> contextlib.AbstractContextManager[Value]:
+        """An array whose place is free again afterwards."""
+        ...
+
     def apply_closed(self, program: Any, given: Sequence[Value], results: Sequence[Value]) -> None:
         """Calls a closed program with values."""

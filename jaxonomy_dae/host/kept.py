@@ -48,7 +48,8 @@ def keep_programs(folder: str | os.PathLike[str] | None) -> None:
     a folder that belongs to somebody else, or into which others may write, is not used, and `compilations()` says so.
     While JAX's own cache is on (`jax_compilation_cache_dir`), it is used instead.
     """
-    _CHOSEN[:] = [None if folder is None else Path(folder).expanduser()]
+    # An empty name is that of the folder a process happens to be in: it means none, as in the variable.
+    _CHOSEN[:] = [Path(folder).expanduser() if folder else None]
 
 
 def folder() -> Path | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base.aliases import Numeric, PyTree
 from ..base.errors import SimulationError
-from .staging import layers
+from .staging import layers, trace_of
 
 SHOWN = 8  # members that a sentence lists
 
@@ -26,7 +26,9 @@ def batch_size(tree: PyTree) -> int:
 
     In `jax.vmap(jax.jit(f))` it cannot be seen from inside f.
     """
-    return max((math.prod(map(_mapped, layers(leaf))) for leaf in jax.tree.leaves(tree)), default=1)
+    # Of each `jax.vmap` once: in a grid by two of them, one leaf may show the one and another leaf the other.
+    sizes = {trace_of(layer): _mapped(layer) for leaf in jax.tree.leaves(tree) for layer in layers(leaf)}
+    return math.prod(sizes.values())
 
 
 def _mapped(layer: Any) -> int:

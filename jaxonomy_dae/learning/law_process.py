@@ -57,6 +57,7 @@ class LawProcess:
         scaled = (places - centre) / half
         dtype = o.system.parameters.values.dtype
         values = np.asarray(jax.vmap(lambda u: jnp.ravel(raw(module)(u)))(jnp.asarray(places, dtype)), float)
+        # Answers are found at the places alone: between them, a kernel as smooth as the process's interpolates.
         gaps = np.linalg.norm(scaled[:, None] - scaled, axis=-1) + np.diag(np.full(len(scaled), np.inf))
         kernel = Kernel(1.0, 0.0, APART * float(np.median(gaps.min(axis=1))))
         bumps = Bumps.of(centre, half, scaled, kernel, dtype)
@@ -67,7 +68,7 @@ class LawProcess:
         process = Process.of(scaled, values, columns, residual)
         if process is None:
             return None
-        odds = np.clip(process.surprise - own, -700, 700)
+        odds = np.clip(process.surprise - own, -700, 700)  # exp of more overflows
         return cls(process, centre, half, float(1 / (1 + np.exp(odds))))
 
     def variance(self, module: Any, law: Callable, points: Any, grid: np.ndarray) -> Float[np.ndarray, " n"]:
@@ -100,6 +101,7 @@ def _reduced(
     low, high = o.bounds
     weights = np.array([group == name for group in o.coordinates.group])[o.free]
     others = ~weights & ~((m.z <= low) | (m.z >= high))
+    # Rows of priors of this law belong to the network's own model; the process has its kernel instead.
     about_law = (prior.jacobian[:, weights] != 0).any(axis=1)
     keep = np.concatenate([np.ones(len(found), bool), ~about_law])
     columns = np.zeros((len(keep), found.shape[1]))

@@ -89,6 +89,7 @@ class Process:
             return None
         scaled = answers * np.repeat(size, len(places))
         target = scaled @ (values / size).T.ravel() - residual
+        # By a triangle, each of the hundred kernels costs as much as the law has places, however long the record is.
         with one_thread(scaled.shape[0] * scaled.shape[1] ** 2):
             triangle = np.asarray(scipy.linalg.qr(np.column_stack([scaled, target]), mode="r")[0])
         triangle = triangle[: scaled.shape[1] + 1]

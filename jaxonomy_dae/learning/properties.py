@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from ..base.errors import ModelError, SimulationError, nearest
+from .band import law_of
 from .evidence import log_evidence
 from .laws.properties import AlongInput, OddPart, Property, ZeroAtZero, raw
 from .laws.shapes import Monotone
@@ -99,7 +100,8 @@ def _kinds(fit: "Estimate", name: str, net: eqx.nn.MLP) -> dict[str, Callable[[A
         kinds["along its input, by its size"] = lambda g: AlongInput(g, small)
     if len(ends) == 1 and net.out_size in (1, "scalar"):
         grid = np.linspace(ends[0, 0], ends[0, 1], 50)
-        mean = fit.band(name, grid).mean
+        module, law, points = law_of(fit, name, grid, None)  # a band would compile a program for its spread
+        mean = np.asarray(jax.vmap(lambda u: law(module, u))(points))
         size, rises = float(np.max(np.abs(mean))) or 1.0, bool(mean[-1] > mean[0])  # the other way, nothing would fit
         kinds["rising" if rises else "falling"] = lambda g: Monotone(
             1, 1, rises, key=jax.random.key(0), width=g.width_size, inputs=float(sizes[0]) or 1.0, outputs=size

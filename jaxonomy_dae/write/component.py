@@ -4,8 +4,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
+import jax
 import numpy as np
 import sympy
+from jax.core import Tracer
 
 from ..base.errors import ModelError, UnknownAttribute, nearest
 from .arrays import ComponentArray, make_array
@@ -313,6 +315,8 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         self._claim(name, "variable")
         if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
             raise ModelError(f"vector variable '{self.name}.{name}' needs a positive number of entries; got {count!r}")
+        if isinstance(start, jax.Array) and not isinstance(start, Tracer):
+            start = np.asarray(start)  # whose entries are read without a program
         is_sequence = isinstance(start, Sequence | np.ndarray) and not isinstance(start, str)
         starts = list(start) if is_sequence else [start] * count
         if len(starts) != count:
@@ -349,6 +353,10 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         self._claim(name, "port")
         if not isinstance(domain, Domain):
             raise ModelError(f"port '{self.name}.{name}' needs a Domain such as Electrical; got {domain!r}")
+        known = [variable for variable, _ in domain.variables]
+        for variable in nominal or ():
+            if variable not in known:
+                raise ModelError(f"port '{self.name}.{name}': nominal names '{variable}': {nearest(variable, known)}")
         port = Port(self, name, domain)
         self.ports[name] = port
         for variable, unit in domain.variables:

@@ -23,6 +23,7 @@ from .events import (
     relation_in_discretes,
     while_on,
 )
+from .real_number import real_number
 from .symbols import DiscreteSymbol, EarlierSymbol, PreviousSymbol, RelationSymbol, VariableSymbol
 
 
@@ -76,8 +77,10 @@ class EventDeclarations:
         for what, value in (("period", period), ("offset", offset)):
             found = sympy.sympify(value)
             where = f"component '{self.name}': the {what} of sampled"
-            if not isinstance(found, sympy.Expr):
+            if isinstance(value, str) or not isinstance(found, sympy.Expr):
                 raise ModelError(f"{where} is a number or an expression in parameters; got {value!r}")
+            if found.is_number:
+                real_number(found, where)
             self._check_parameters_only(found, where)
             if any(isinstance(s, DiscreteSymbol) for s in found.free_symbols):
                 raise ModelError(f"{where} must not change between events; it uses a discrete variable: {found}")

@@ -33,6 +33,7 @@ from jaxonomy_dae.library.electrical import Ground, Resistor
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.translational import Mass, Spring
 from jaxonomy_dae.write import Eq as our_eq
+from jaxonomy_dae.write import Hydraulic
 
 
 def dense(inputs, outputs):
@@ -456,3 +457,27 @@ def test_a_start_time_is_a_number(t0):
 def test_a_package_that_is_missing():
     with pytest.raises(ImportError, match=r"plans need planes: pip install 'jaxonomy_dae\[flight\]'"):
         optional_module("no_such_planes", "flight", "plans need planes")
+
+
+def test_sizes_of_a_port_are_by_its_variables():
+    """A name that the domain lacks was left out, without a word."""
+
+    class Piped(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            self.port("a", Hydraulic, nominal={"m_flwo": 1e-6})
+
+    with pytest.raises(ModelError, match=r"port 'p\.a': nominal names 'm_flwo': did you mean 'm_flow'"):
+        Piped(EqnEnv(), "p")
+
+
+@pytest.mark.parametrize("start", [np.array([1.0, 2.0]), device_put(np.array([1.0, 2.0])), [1, 2]])
+def test_lengths_and_starts_of_vectors(start):
+    """Numbers of NumPy and JAX count as Python's do."""
+
+    class Two(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            self.vector("x", np.int64(2), start=start)
+
+    assert [v.start for v in Two(EqnEnv(), "t").variables.values()] == [1.0, 2.0]

@@ -164,3 +164,10 @@ def test_a_relation_in_which_time_cancels():
         c.add_equations(Eq(der(x), sympy.Piecewise((a, still > 0.5), (0, True))))
 
     assert not model(write).plan.events.n_clocks
+
+
+@pytest.mark.parametrize("clock", [("0.1",), (0.1, float("nan")), (0.1, float("inf")), (0.1, sympy.I)])
+def test_clocks_that_could_not_tick(clock):
+    """A clock whose offset is no number never ticked, without a word."""
+    with pytest.raises(ModelError, match=r"component 'c': the (period|offset) of sampled (is|must be) "):
+        component(lambda c, ev: c.when(c.sampled(*clock), assign(c.discrete("n"), 1)))

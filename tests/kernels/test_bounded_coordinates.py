@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from problems import compiled, component, mlp
 
-from jaxonomy_dae import Interval, ModelError
+from jaxonomy_dae import Eq, Interval, ModelError, der
 from jaxonomy_dae.run.system.bounds import Ends, constrained, unconstrained
 from jaxonomy_dae.write.interval import NONNEGATIVE, POSITIVE
 
@@ -62,6 +62,23 @@ def test_an_end_at_infinity_is_no_bound_however_it_is_written():
     assert everything == Interval()
     np.testing.assert_allclose(constrained(z, Ends.of([everything] * 2)), z)
     np.testing.assert_allclose(constrained(z, Ends.of([below] * 2)), 0.5 - np.exp(-np.asarray(z)))
+
+
+def test_ends_in_single_precision():
+    """0.3 is 0.30000001 there: the end of the interval, and no value beyond it."""
+
+    def write(c, ev):
+        x = c.variable("x", start=c.parameter("b", 0.2, bounds=(0.1, 0.3)), fixed=True)
+        c.add_equations(Eq(der(x), 1))
+
+    with jax.enable_x64(False):
+        system = compiled(component(write))
+        for z, end in ((200.0, 0.3), (-200.0, 0.1)):
+            assert system.constrain({"c.b": jnp.array(z)}).parameters["c.b"] == np.float32(end)
+            assert system.with_parameters({"c.b": np.float32(end)}).parameters["c.b"] == np.float32(end)
+        for value in (0.301, 0.099, 1e300):
+            with pytest.raises(ModelError, match=r"must lie in \[0\.1, 0\.3\]"):
+                system.with_parameters({"c.b": value})
 
 
 def test_of_systems():

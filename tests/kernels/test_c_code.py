@@ -225,3 +225,19 @@ def test_the_same_program_gives_the_same_text():
     texts = [program_in_c({"f": jax.make_jaxpr(lambda x: f(x))(V)})[0] for _ in range(2)]
     assert texts[0] == texts[1]
     assert texts[0].count("static void") == 2  # `big` is written once
+
+
+def test_what_is_known_or_done_is_not_computed(tmp_path):
+    """Places of gathers are tables, equal values are computed once, arrays that nobody reads any more are changed in
+    place, and equal numbers have no table."""
+    places = jnp.array([4, -1, 0])
+
+    def f(x):
+        twice = jnp.sin(x) + jnp.sin(x)
+        changed = jnp.zeros(40).at[places].add(x[places]).at[places + 1].set(twice[jnp.array([1, 2, 3])])
+        return changed * 2.0, jnp.stack([x, -x])[jnp.array([[1, 0], [0, 1]]), jnp.array([2, 3])]
+
+    text, _ = program_in_c({"f": jax.make_jaxpr(f)(V)})
+    assert text.count("sin(") == 1 and "40 * sizeof" not in text and " < 0 ? 0 :" not in text
+    assert "static const double" not in text
+    agree(in_c({"f": (f, (V,))}, tmp_path)["f"](V), f(V), 1e-15)

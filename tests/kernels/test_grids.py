@@ -9,6 +9,7 @@ from problems import compiled as system_of
 
 from jaxonomy_dae import Component, EqnEnv, der
 from jaxonomy_dae.host.cache import compiled
+from jaxonomy_dae.host.members import batch_size
 from jaxonomy_dae.run.simulation.event_log import Side
 from jaxonomy_dae.write import Eq
 
@@ -37,6 +38,13 @@ NESTED = {
 def test_each_argument_keeps_its_own_axis(form):
     """Beside the same law that JAX transforms without programs of this package."""
     np.testing.assert_allclose(NESTED[form](compiled(law)), NESTED[form](law), rtol=1e-14)
+
+
+def test_the_size_of_a_grid():
+    """By which memory for records is shared out."""
+    seen = []
+    jax.vmap(lambda a: jax.vmap(lambda b: seen.append(batch_size({"a": a, "b": b, "c": 1.0})) or a * b)(jnp.ones(5)))(A)
+    assert seen == [10]
 
 
 class Falling(Component):

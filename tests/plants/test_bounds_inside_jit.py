@@ -90,6 +90,17 @@ def test_an_input_that_stops_being_finite(system):
 
 
 @pytest.mark.slow
+def test_a_run_backwards(system):
+    """Refused where t1 is known, and as little a result where it is not."""
+    run = jax.jit(
+        lambda t1: (lambda s: (s["c.x"][-1], s.result))(simulate(system, t1, inputs={"c.u": 0.0}, max_steps=64))
+    )
+    (x, result), (back, code) = run(1.0), run(-1.0)
+    assert result == diffrax.RESULTS.successful and np.isclose(x, np.exp(-1), rtol=1e-5)
+    assert code == diffrax.RESULTS.nonfinite and np.isnan(back)
+
+
+@pytest.mark.slow
 def test_a_loop_of_a_users_own_in_free_numbers(system):
     """k = 0.2 found by Optax from data, by steps that would leave [0, 10] if they were taken in k."""
     optimizer = optax.adam(0.3)

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import shutil
 import subprocess
 import threading
 import zipfile
@@ -20,6 +21,7 @@ from jaxonomy_dae import Component, EqnEnv, der, terminate
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.fmi import export_fmu
 from jaxonomy_dae.fmi.compilers import FLAGS, compiler_for, this_platform
+from jaxonomy_dae.fmi.description import structured
 from jaxonomy_dae.write import Eq
 
 pytestmark = pytest.mark.skipif(compiler_for(this_platform()) is None, reason="no C compiler on this machine")
@@ -161,6 +163,10 @@ def model_pointer():
     return ctypes.POINTER(ctypes.c_double)
 
 
+def test_other_letters_have_names_of_their_own():
+    assert [structured(f"m{letter}.x") for letter in "üö"] == ["'m_u00fc.x'", "'m_u00f6.x'"]
+
+
 def test_bad_values_are_refused_by_name(ball, heated):
     import fmpy
 
@@ -198,6 +204,14 @@ def test_what_cannot_be_exported_is_refused_by_name(tmp_path, ball):
         export_fmu(system, tmp_path / "x.fmu", fmi=2, arrays=True)
     with pytest.raises(ModelError, match="kinds: 'simulink' is not known"):
         export_fmu(system, tmp_path / "x.fmu", kinds=["simulink"])
+    with pytest.raises(ModelError, match=r"kinds is a list of names; write kinds=\['co_simulation'\]"):
+        export_fmu(system, tmp_path / "x.fmu", kinds="co_simulation")
+    for tolerance in (0.0, math.nan, 1.0):
+        with pytest.raises(ModelError, match="tolerance is a number between 0 and 1"):
+            export_fmu(system, tmp_path / "x.fmu", tolerance=tolerance)
+    for stop in (0.0, -1.0, math.inf, math.nan):
+        with pytest.raises(ModelError, match="stop_time is a positive number of seconds"):
+            export_fmu(system, tmp_path / "x.fmu", stop_time=stop)
 
     def gamma(u):
         return jax.scipy.special.gammainc(2.0, u)
@@ -397,6 +411,39 @@ def test_sanitizers_find_nothing(tmp_path, kind, least):
     done = subprocess.run(["./drive", "20000", "1e-3"], cwd=tmp_path, capture_output=True, text=True)
     assert not done.returncode, done.stdout + done.stderr
     assert int(done.stdout.split()[-1]) >= least
+
+
+@pytest.mark.slow
+def test_importers_are_told_to_begin_anew_where_a_mode_changes(tmp_path):
+    """A thermostat switches off: its temperature goes on, with another slope."""
+    with opened(exported(hybrid(Thermostat, "c"), tmp_path)) as fmu:
+        assert fmu.get("c.on")[0] == 1.0
+        fmu.model.enterContinuousTimeMode()
+        fmu.model.setContinuousStates(np.array([52.0]).ctypes.data_as(model_pointer()), 1)
+        fmu.model.completedIntegratorStep()
+        fmu.model.enterEventMode()
+        told = fmu.model.updateDiscreteStates()[3]
+        assert told and fmu.get("c.T")[0] == 52.0 and fmu.get("c.on")[0] == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("valgrind") is None, reason="Valgrind is not installed")
+def test_valgrind_finds_nothing_in_many_events(ball, tmp_path):
+    """A ball that bounces 10,000 times at one place: no byte that is read or left behind wrongly, and as much memory as
+    100 times."""
+    with zipfile.ZipFile(ball) as file:
+        file.extractall(tmp_path)
+    driver = Path(__file__).parent.parent / "fmu_bounces.c"
+    command = [*(compiler_for(this_platform()) or ()), "-std=c99", "-O1", "-g", "-ffp-contract=off", "-Isources"]
+    subprocess.run([*command, str(driver), "-o", "bounce", "-lm"], cwd=tmp_path, check=True)
+    taken = []
+    for n in ("100", "10000"):
+        check = ["valgrind", "--leak-check=full", "--show-leak-kinds=all", "--error-exitcode=9", "./bounce", n]
+        done = subprocess.run(check, cwd=tmp_path, capture_output=True, text=True)
+        assert not done.returncode and done.stdout.split()[-1] == n, done.stdout + done.stderr
+        assert "no leaks are possible" in done.stderr
+        taken.append(done.stderr.split("total heap usage: ")[1].split(" allocs")[0])
+    assert taken[0] == taken[1]
 
 
 @pytest.mark.slow

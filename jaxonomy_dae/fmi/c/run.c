@@ -117,7 +117,9 @@ static int updated(Model *m, Update *u) {
   if (stuck < -1)
     return failure(m, FAILED, "Two events give one variable different values at one instant.", "", "");
   if (!fine) return failure(m, DISCARD, "After the events of this instant the equations have no finite solution.", "", "");
-  u->states = NX > 0 && memcmp(s->d + AT_X, m->next + AT_X, NX * sizeof *s->d) != 0;
+  /* Some importers begin their integration anew only if they are told that states have changed. They have to where a mode
+     has, too: their method extrapolates from slopes of the equations before the event. */
+  u->states = NX > 0 && (fired || memcmp(s->d + AT_X, m->next + AT_X, NX * sizeof *s->d) != 0);
   memcpy(s->d, m->next, sizeof s->d);
   s->last = s->d[AT_T];
   u->again = fired;

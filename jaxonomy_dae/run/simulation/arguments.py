@@ -34,8 +34,8 @@ MOST_ROOM = 4 * 2**30  # bytes that saved steps may reserve
 
 NOT_ADMITTED: Result = diffrax.RESULTS.nonfinite
 TEXT = (
-    "a parameter, a weight or an input is not finite, a parameter is out of its bounds, or the samples of an input do "
-    "not increase in time or do not reach over the run"
+    "a parameter, a weight or an input is not finite, a parameter is out of its bounds, t1 is before t0, or the "
+    "samples of an input do not increase in time or do not reach over the run"
 )
 # Times at which inputs are looked at, relative to what is left of a run: what made it stop lies just ahead, on a scale
 # that only the run knows.
@@ -212,13 +212,14 @@ def check_parameters(system: AcausalSystem):
 
 
 def are_admitted(system: AcausalSystem, inputs: Inputs, t0: Time, t1: Time) -> Bool[Array, ""]:
-    """True if parameters, weights, constants and samples are finite, parameters are within their bounds, and samples
-    reach over the run."""
+    """True if parameters, weights, constants and samples are finite, parameters are within their bounds, samples reach
+    over the run, and it does not go backwards."""
     data = [source for source in inputs.values() if not isinstance(source, ClosedFunction)]
     leaves = jax.tree.leaves(eqx.filter((system.neural, data), eqx.is_inexact_array))
     finite = [jnp.isfinite(leaf).all() for leaf in leaves]
     fit = [samples_fit(inputs, t0, t1)] if any(isinstance(s, SampledInput) for s in data) else []
-    return jnp.stack([system.parameters.are_admitted, *finite, *fit]).all()
+    # Backwards, clocks would not tick, and conditions become true where they cease to be.
+    return jnp.stack([system.parameters.are_admitted, t0 <= t1, *finite, *fit]).all()
 
 
 def inputs_are_finite(inputs: Inputs, t: Time, t1: Time) -> Bool[Array, ""]:

@@ -145,9 +145,9 @@ def simulate(
     - `throw`: whether to raise an error if the start is inconsistent or the integration fails. With False,
         `solution.result` has a code, and rows that were not reached are NaN, with their derivatives.
         `RESULTS.nonfinite` stands for parameters out of bounds, for parameters, weights and inputs that are not finite,
-        and for samples that do not cover the run. None raises outside jit and vmap. `jax.vmap` outside of jit warns
-        instead and names the members that failed. Inside jit, True puts callbacks to the host into the program, and
-        JAX's persistent cache does not keep such a program.
+        for a run backwards in time, and for samples that do not cover the run. None raises outside jit and vmap.
+        `jax.vmap` outside of jit warns instead and names the members that failed. Inside jit, True puts callbacks to
+        the host into the program, and JAX's persistent cache does not keep such a program.
 
     **Returns:**
 

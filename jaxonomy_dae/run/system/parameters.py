@@ -331,7 +331,7 @@ class Parameters(eqx.Module):
         if is_traced(value):
             return value
         numbers = np.array([real_number(number, where) for number in np.ravel(np.asarray(value))])
-        self.table.check(np.array(k), numbers)
+        self.table.check(np.array(k), self._as_kept(numbers))
         return value
 
     def _checked_array(self, name: str, entries: np.ndarray, value: Any, batch: tuple[int, ...]) -> Any:
@@ -344,8 +344,14 @@ class Parameters(eqx.Module):
             raise ModelError(f"{where} must be real; got {jnp.result_type(value)}")
         if is_traced(value):
             return value
-        self.table.check(entries, np.asarray(value, np.float64))
+        self.table.check(entries, self._as_kept(np.asarray(value)))
         return value
+
+    def _as_kept(self, numbers: np.ndarray) -> np.ndarray:
+        """Numbers in the precision of all values: in single precision, the end of an interval is the number next to
+        it."""
+        with np.errstate(over="ignore"):  # said as infinite
+            return numbers.astype(self.values.dtype)
 
     @property
     def batch(self) -> tuple[int, ...]:
