@@ -16,7 +16,7 @@ from open_classes import by_differences, opened, run_with_slopes
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, Rotational, der, simulate
 from jaxonomy_dae.library import electrical, rotational, thermal, translational
-from jaxonomy_dae.library.signal import Constant
+from jaxonomy_dae.library.signal import Constant, Step
 from jaxonomy_dae.modelica import Library
 from jaxonomy_dae.solvers import Rodas5P
 
@@ -411,3 +411,30 @@ def test_an_induction_machine_on_an_inverter(library):
     np.testing.assert_allclose([found[n] for n in names], reference(*values.values()), rtol=1e-6, atol=1e-6)
     for name, by_hand in by_differences(reference, values).items():
         assert slopes[name] == pytest.approx(by_hand, rel=1e-4), name
+
+
+def test_a_gear_with_losses(library):
+    """A gear that loses a tenth of what drives it, and a fifth where the load drives: our torque turns its sign."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    Gear = library.component("Modelica.Mechanics.Rotational.Components.LossyGear", "lossTable = [0, 0.9, 0.8, 0, 0]")
+    gear = Gear(ev, "gear", ratio=2.0)
+    motor = rotational.Inertia(ev, "motor", J=0.5, initial_angle=0.0, initial_speed=4.0)
+    load, torque = rotational.Inertia(ev, "load", J=3.0), rotational.Torque(ev, "torque")
+    wanted = Step(ev, "wanted", height=-1.8, start_time=1.0, offset=1.2)
+    d.add(gear, motor, load, torque, wanted)
+    d.connect(wanted.y, torque.tau)
+    d.connect(torque.flange, motor.flange_a, gear.flange_a)
+    d.connect(gear.flange_b, load.flange_a)
+    system = AcausalCompiler(ev, d)()
+    values = {"gear.ratio": 2.0, "motor.J": 0.5, "load.J": 3.0, "wanted.height": -1.8, "wanted.start_time": 1.0}
+    ts = np.array([0.5, 1.5, 3.0])
+    found, slopes = run_with_slopes(system, values, ts, ["motor.w"], ["motor.w"])
+
+    def reference(ratio, J, load, height, turns):
+        driven = 1.2 / (J + load / (0.9 * ratio**2))
+        driving = (1.2 + height) / (J + 0.8 * load / ratio**2)
+        return 4.0 + driven * np.minimum(ts, turns) + driving * np.maximum(ts - turns, 0.0)
+
+    np.testing.assert_allclose(found["motor.w"], reference(*values.values()), rtol=1e-7)
+    for name, by_hand in by_differences(reference, values).items():
+        assert slopes[name] == pytest.approx(by_hand, rel=1e-5), name
