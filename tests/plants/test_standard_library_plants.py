@@ -262,6 +262,90 @@ DENSITY, HEAT = 995.586, 4184.0  # of this medium, in kg/m3 and J/(kg.K)
 LAMINAR = "Modelica.Fluid.Pipes.BaseClasses.FlowModels.NominalLaminarFlow(dp_nominal = 2e4, m_flow_nominal = 1)"
 
 
+# The front end takes no arrays of connectors with streams at the border of a class.
+BASIN = """
+model Basin "a tank with two ports"
+  package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater;
+  inner Modelica.Fluid.System system;
+  Modelica.Fluid.Interfaces.FluidPort_a a(redeclare package Medium = Medium), b(redeclare package Medium = Medium);
+  Modelica.Fluid.Vessels.OpenTank tank(redeclare package Medium = Medium, nPorts = 2, use_portsData = false,
+    height = 20, crossArea = 0.1);
+equation
+  connect(a, tank.ports[1]);
+  connect(b, tank.ports[2]);
+end Basin;
+"""
+
+
+PUMP = """model Lift
+  package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater;
+  inner Modelica.Fluid.System system;
+  function straight
+    extends Modelica.Fluid.Machines.BaseClasses.PumpCharacteristics.baseFlow;
+  algorithm
+    head := 8 - 4000*V_flow;
+  end straight;
+  Modelica.Fluid.Interfaces.FluidPort_a a(redeclare package Medium = Medium), b(redeclare package Medium = Medium);
+  Modelica.Fluid.Machines.PrescribedPump pump(redeclare package Medium = Medium, redeclare function flowCharacteristic = straight, N_nominal = 1200, rho_nominal = 995.586);
+equation
+  connect(a, pump.port_a);
+  connect(b, pump.port_b);
+end Lift;
+"""  # noqa: E501
+
+
+def test_tanks_with_a_pump_between_which_the_flow_turns(library):
+    """A pump fills a tank that a pipe and our valve's opening join to a higher one: the flow in the pipe turns. Levels
+    and temperatures by the balances of mass and energy; the pump heats what it lifts."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    Basin = library.component("Basin", source=BASIN)
+    Pipe = library.component("Modelica.Fluid.Pipes.StaticPipe", WATER, f"redeclare model FlowModel = {LAMINAR}")
+    Valve = library.component("Modelica.Fluid.Valves.ValveLinear", WATER)
+    Source = library.component("Modelica.Fluid.Sources.Boundary_pT", WATER, nPorts=1)
+    low = Basin(ev, "low", start={"tank.level": 1.0, "tank.medium.T": 300.0})
+    high = Basin(ev, "high", start={"tank.level": 5.0, "tank.medium.T": 340.0})
+    nominal = {"flowModel.dp_nominal": 2e4, "flowModel.m_flow_nominal": 1.0}
+    pipe = Pipe(ev, "pipe", length=1.0, diameter=0.1, **nominal)
+    valve, pump = (
+        Valve(ev, "valve", dp_nominal=2e4, m_flow_nominal=1.0),
+        library.component("Lift", source=PUMP)(ev, "pump"),
+    )
+    source, opening = Source(ev, "source", p=101325.0, T=290.0), Constant(ev, "opening", 0.5)
+    d.add(low, high, pump, pipe, valve, source, opening)
+    d.connect(source.ports["ports[1]"], pump.a)
+    d.connect(pump.b, low.a)
+    d.connect(low.b, pipe.port_a)
+    d.connect(pipe.port_b, valve.port_a)
+    d.connect(valve.port_b, high.a)
+    d.connect(opening.y, valve.opening)
+    system = AcausalCompiler(ev, d)()
+    values = {"opening.k": 0.5, "low.tank.crossArea": 0.1, "source.T": 290.0, "valve.m_flow_nominal": 1.0}
+    ts = np.array([40.0, 150.0, 500.0])
+    names = ["low.tank.level", "high.tank.level", "low.tank.medium.T", "high.tank.medium.T", "pipe.port_a.m_flow"]
+    found, slopes = run_with_slopes(system, values, ts, names, names)
+
+    def reference(opening, area, T, nominal):
+        def flow(x):
+            return DENSITY * G * (x[0] - x[1]) / (2e4 + 2e4 / (opening * nominal))
+
+        def slope(t, x):
+            lifted = DENSITY * (8.0 - x[0]) / 4000.0
+            warm, m = T + x[0] * G / 0.8 / HEAT, flow(x)
+            low = lifted * (warm - x[2]) + min(m, 0.0) * (x[2] - x[3])
+            high = max(m, 0.0) * (x[2] - x[3])
+            masses = DENSITY * np.array([area, 0.1]) * x[:2]
+            return [(lifted - m) / DENSITY / area, m / DENSITY / 0.1, low / masses[0], high / masses[1]]
+
+        x = solved(slope, [1.0, 5.0, 300.0, 340.0], ts, rtol=1e-13)
+        return np.array([*x, flow(x)])
+
+    expected = reference(*values.values())
+    assert expected[-1, 0] < 0.0 < expected[-1, -1]
+    np.testing.assert_allclose([found[n] for n in names], expected, rtol=1e-6)
+    for name, by_hand in by_differences(reference, values).items():
+        assert slopes[name] == pytest.approx(by_hand, rel=1e-5), name
+
+
 def test_a_pipe_with_heated_walls(library):
     """Water flows through a pipe of two volumes; our walls, one of which is heated, give heat to each."""
     ev, d = EqnEnv(), AcausalDiagram()
