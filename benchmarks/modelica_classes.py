@@ -142,7 +142,7 @@ def main() -> int:
             with open(asked.out, "a", encoding="utf-8") as out:
                 out.write(json.dumps(row) + "\n")
         left = [n for n in left if n not in done]
-    page = _page([done[n] for n in names if n in done], all_of_them, asked.sample)
+    page = _page([done[n] for n in names if n in done], len(left), all_of_them, asked.sample)
     print(page)
     if asked.page:
         Path(asked.page).write_text(page, encoding="utf-8")
@@ -281,7 +281,7 @@ def _compiled(of: OpenClass) -> dict:
     return {"states": len(system.states)}
 
 
-def _page(rows: list[dict], all_of_them: int, seed: int | None) -> str:
+def _page(rows: list[dict], left: int, all_of_them: int, seed: int | None) -> str:
     partial = [r for r in rows if "is partial" in r.get("why", "")]
     bare = [r for r in rows if r.get("connectors") == 0]
     rows = [r for r in rows if r not in partial and r not in bare]
@@ -294,7 +294,7 @@ def _page(rows: list[dict], all_of_them: int, seed: int | None) -> str:
         + (f", drawn with the seed {seed}" if seed is not None else "")
         + f". Partial: {len(partial)}; without connectors: {len(bare)}; both are left out below.",
         "",
-        _share(rows),
+        _share(rows, left),
         "",
         "| package | classes | opened | translated | compiled |",
         "|---|---|---|---|---|",
@@ -311,17 +311,21 @@ def _page(rows: list[dict], all_of_them: int, seed: int | None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _share(rows: list[dict]) -> str:
-    """The share of classes that compile, with its interval of Wilson."""
+def _share(rows: list[dict], left: int) -> str:
+    """The share of classes that compile, with its interval of Wilson; `left` of the sample have not been tried."""
     compiled = sum(r["reached"] == "compiled" for r in rows)
     if not rows:
         return ""
     interval = scipy.stats.binomtest(compiled, len(rows)).proportion_ci(method="wilson")
     low, high = (100 * x for x in interval)
     share = 100 * compiled / len(rows)
+    whole = "the whole library" if not left else "those that do not take long to open"
+    untried = (
+        f" {left} classes of the sample have not been tried, all that take long to open among them." if left else ""
+    )
     return (
-        f"{compiled} of {len(rows)} compile, {share:.0f} %: of the whole library, with a confidence of 95 %, between "
-        f"{low:.0f} % and {high:.0f} %."
+        f"{compiled} of {len(rows)} compile, {share:.0f} %: of {whole}, between {low:.0f} % and {high:.0f} % with a "
+        f"confidence of 95 %.{untried}"
     )
 
 

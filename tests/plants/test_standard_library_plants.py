@@ -4,6 +4,9 @@ Each stands in a plant with our own parts, beside its equations in SciPy; slopes
 `MODELICA_LIBRARY` names the folder of the library; without it the tests are skipped.
 """
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
@@ -11,9 +14,9 @@ import scipy.optimize
 from device_library import standard_library
 from open_classes import by_differences, opened, run_with_slopes
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, Rotational, der, simulate
 from jaxonomy_dae.library import electrical, rotational, thermal, translational
-from jaxonomy_dae.library.signal import Constant
+from jaxonomy_dae.library.signal import Constant, Step
 from jaxonomy_dae.modelica import Library
 from jaxonomy_dae.solvers import Rodas5P
 
@@ -182,9 +185,165 @@ def test_a_spherical_pendulum_and_a_body_in_flight(library):
         assert slopes[name] == pytest.approx(expected, rel=1e-5), name
 
 
+class Motor(Component):
+    """A network of the angle and the speed is the torque on a flange."""
+
+    def __init__(self, ev: EqnEnv, name: str, network):
+        super().__init__(ev, name)
+        a = self.port("flange", Rotational)
+        speed = self.variable("w")
+        (torque,) = self.learned("law", network, [a.phi, speed])
+        self.add_equations(Eq(speed, der(a.phi)), Eq(a.tau, -torque))
+
+
+def test_a_double_pendulum_with_a_network_in_its_joint(library):
+    """A network turns the first joint of two links. The equations of Lagrange with its weights, by SciPy; the
+    derivative along a direction of its weights by differences."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    world = library.component(f"Modelica.{BODIES}.World", enableAnimation=False)(ev, "world")
+    Driven = library.component(f"Modelica.{BODIES}.Joints.Revolute", useAxisFlange=True)
+    first = Driven(ev, "first", start={"phi": 0.3, "w": 0.2})
+    second = opened(library, f"{BODIES}.Joints.Revolute")(ev, "second", start={"phi": 0.5, "w": 0.0})
+    link = opened(library, f"{BODIES}.Parts.FixedTranslation")(ev, "link", r=[0.7, 0.0, 0.0])
+    Body = opened(library, f"{BODIES}.Parts.Body")
+    upper = Body(ev, "upper", m=1.2, r_CM=[0.3, 0.0, 0.0], I_33=0.05)
+    lower = Body(ev, "lower", m=0.8, r_CM=[0.4, 0.0, 0.0], I_33=0.02)
+    network = eqx.nn.MLP(2, 1, 6, 1, activation=jnp.tanh, key=jax.random.key(0))
+    motor = Motor(ev, "motor", network)
+    d.add(world, first, second, link, upper, lower, motor)
+    d.connect(world.frame_b, first.frame_a)
+    d.connect(first.frame_b, link.frame_a, upper.frame_a)
+    d.connect(link.frame_b, second.frame_a)
+    d.connect(second.frame_b, lower.frame_a)
+    d.connect(first.axis, motor.flange)
+    wanted = ["first.phi", "first.w", "second.phi", "second.w"]
+    system = AcausalCompiler(ev, d, state_selection="dummy_derivatives", prefer_states=wanted)()
+    assert system.states == wanted
+    weights, rest = eqx.partition(network, eqx.is_array)
+    ts = np.array([0.4, 0.8, 1.2])
+    towards = jax.tree.map(lambda w: jnp.cos(jnp.arange(w.size, dtype=float)).reshape(w.shape), weights)
+
+    def moved(step):
+        return jax.tree.map(lambda w, v: w + step * v, weights, towards)
+
+    def run(step):
+        moving = eqx.tree_at(lambda s: s.neural["motor.law"], system, eqx.combine(moved(step), rest))
+        solution = simulate(moving, 1.2, ts=jnp.asarray(ts), rtol=1e-9, atol=1e-11)
+        found = jnp.stack([solution["first.phi"], solution["second.phi"]])
+        return found[:, -1].sum(), found
+
+    (_, found), by_weights = jax.jit(jax.value_and_grad(run, has_aux=True))(0.0)
+
+    def swing(step):
+        matrices = [(np.asarray(layer.weight), np.asarray(layer.bias)) for layer in moved(step).layers]
+        a, b, c = 0.05 + 1.2 * 0.09 + 0.8 * 0.49, 0.8 * 0.7 * 0.4, 0.02 + 0.8 * 0.16
+
+        def slope(t, x):
+            (one, two), (v, w) = x[:2], x[2:]
+            (A, p), (B, q) = matrices
+            torque = (B @ np.tanh(A @ np.array([one, v]) + p) + q)[0]
+            sin, cos = np.sin(two - one), np.cos(two - one)
+            right = [
+                torque + b * sin * w**2 - (1.2 * 0.3 + 0.8 * 0.7) * G * np.cos(one),
+                -b * sin * v**2 - 0.8 * 0.4 * G * np.cos(two),
+            ]
+            return [v, w, *np.linalg.solve([[a, b * cos], [b * cos, c]], right)]
+
+        run = solved(slope, [0.3, 0.8, 0.2, 0.2], ts)
+        return np.array([run[0], run[1] - run[0]])
+
+    np.testing.assert_allclose(found, swing(0.0), atol=1e-7)
+    expected = (swing(1e-4) - swing(-1e-4))[:, -1].sum() / 2e-4
+    assert float(by_weights) == pytest.approx(expected, rel=1e-5)
+
+
 WATER = "redeclare package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater"
 DENSITY, HEAT = 995.586, 4184.0  # of this medium, in kg/m3 and J/(kg.K)
 LAMINAR = "Modelica.Fluid.Pipes.BaseClasses.FlowModels.NominalLaminarFlow(dp_nominal = 2e4, m_flow_nominal = 1)"
+
+
+# The front end takes no arrays of connectors with streams at the border of a class.
+BASIN = """
+model Basin "a tank with two ports"
+  package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater;
+  inner Modelica.Fluid.System system;
+  Modelica.Fluid.Interfaces.FluidPort_a a(redeclare package Medium = Medium), b(redeclare package Medium = Medium);
+  Modelica.Fluid.Vessels.OpenTank tank(redeclare package Medium = Medium, nPorts = 2, use_portsData = false,
+    height = 20, crossArea = 0.1);
+equation
+  connect(a, tank.ports[1]);
+  connect(b, tank.ports[2]);
+end Basin;
+"""
+
+
+PUMP = """model Lift
+  package Medium = Modelica.Media.Water.ConstantPropertyLiquidWater;
+  inner Modelica.Fluid.System system;
+  function straight
+    extends Modelica.Fluid.Machines.BaseClasses.PumpCharacteristics.baseFlow;
+  algorithm
+    head := 8 - 4000*V_flow;
+  end straight;
+  Modelica.Fluid.Interfaces.FluidPort_a a(redeclare package Medium = Medium), b(redeclare package Medium = Medium);
+  Modelica.Fluid.Machines.PrescribedPump pump(redeclare package Medium = Medium, redeclare function flowCharacteristic = straight, N_nominal = 1200, rho_nominal = 995.586);
+equation
+  connect(a, pump.port_a);
+  connect(b, pump.port_b);
+end Lift;
+"""  # noqa: E501
+
+
+def test_tanks_with_a_pump_between_which_the_flow_turns(library):
+    """A pump fills a tank that a pipe and our valve's opening join to a higher one: the flow in the pipe turns. Levels
+    and temperatures by the balances of mass and energy; the pump heats what it lifts."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    Basin = library.component("Basin", source=BASIN)
+    Pipe = library.component("Modelica.Fluid.Pipes.StaticPipe", WATER, f"redeclare model FlowModel = {LAMINAR}")
+    Valve = library.component("Modelica.Fluid.Valves.ValveLinear", WATER)
+    Source = library.component("Modelica.Fluid.Sources.Boundary_pT", WATER, nPorts=1)
+    low = Basin(ev, "low", start={"tank.level": 1.0, "tank.medium.T": 300.0})
+    high = Basin(ev, "high", start={"tank.level": 5.0, "tank.medium.T": 340.0})
+    nominal = {"flowModel.dp_nominal": 2e4, "flowModel.m_flow_nominal": 1.0}
+    pipe = Pipe(ev, "pipe", length=1.0, diameter=0.1, **nominal)
+    valve, pump = (
+        Valve(ev, "valve", dp_nominal=2e4, m_flow_nominal=1.0),
+        library.component("Lift", source=PUMP)(ev, "pump"),
+    )
+    source, opening = Source(ev, "source", p=101325.0, T=290.0), Constant(ev, "opening", 0.5)
+    d.add(low, high, pump, pipe, valve, source, opening)
+    d.connect(source.ports["ports[1]"], pump.a)
+    d.connect(pump.b, low.a)
+    d.connect(low.b, pipe.port_a)
+    d.connect(pipe.port_b, valve.port_a)
+    d.connect(valve.port_b, high.a)
+    d.connect(opening.y, valve.opening)
+    system = AcausalCompiler(ev, d)()
+    values = {"opening.k": 0.5, "low.tank.crossArea": 0.1, "source.T": 290.0, "valve.m_flow_nominal": 1.0}
+    ts = np.array([40.0, 150.0, 500.0])
+    names = ["low.tank.level", "high.tank.level", "low.tank.medium.T", "high.tank.medium.T", "pipe.port_a.m_flow"]
+    found, slopes = run_with_slopes(system, values, ts, names, names)
+
+    def reference(opening, area, T, nominal):
+        def flow(x):
+            return DENSITY * G * (x[0] - x[1]) / (2e4 + 2e4 / (opening * nominal))
+
+        def slope(t, x):
+            lifted = DENSITY * (8.0 - x[0]) / 4000.0
+            warm, m = T + x[0] * G / 0.8 / HEAT, flow(x)
+            low = lifted * (warm - x[2]) + min(m, 0.0) * (x[2] - x[3])
+            high = max(m, 0.0) * (x[2] - x[3])
+            masses = DENSITY * np.array([area, 0.1]) * x[:2]
+            return [(lifted - m) / DENSITY / area, m / DENSITY / 0.1, low / masses[0], high / masses[1]]
+
+        x = solved(slope, [1.0, 5.0, 300.0, 340.0], ts, rtol=1e-13)
+        return np.array([*x, flow(x)])
+
+    expected = reference(*values.values())
+    assert expected[-1, 0] < 0.0 < expected[-1, -1]
+    np.testing.assert_allclose([found[n] for n in names], expected, rtol=1e-6)
+    for name, by_hand in by_differences(reference, values).items():
+        assert slopes[name] == pytest.approx(by_hand, rel=1e-5), name
 
 
 def test_a_pipe_with_heated_walls(library):
@@ -336,3 +495,30 @@ def test_an_induction_machine_on_an_inverter(library):
     np.testing.assert_allclose([found[n] for n in names], reference(*values.values()), rtol=1e-6, atol=1e-6)
     for name, by_hand in by_differences(reference, values).items():
         assert slopes[name] == pytest.approx(by_hand, rel=1e-4), name
+
+
+def test_a_gear_with_losses(library):
+    """A gear that loses a tenth of what drives it, and a fifth where the load drives: our torque turns its sign."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    Gear = library.component("Modelica.Mechanics.Rotational.Components.LossyGear", "lossTable = [0, 0.9, 0.8, 0, 0]")
+    gear = Gear(ev, "gear", ratio=2.0)
+    motor = rotational.Inertia(ev, "motor", J=0.5, initial_angle=0.0, initial_speed=4.0)
+    load, torque = rotational.Inertia(ev, "load", J=3.0), rotational.Torque(ev, "torque")
+    wanted = Step(ev, "wanted", height=-1.8, start_time=1.0, offset=1.2)
+    d.add(gear, motor, load, torque, wanted)
+    d.connect(wanted.y, torque.tau)
+    d.connect(torque.flange, motor.flange_a, gear.flange_a)
+    d.connect(gear.flange_b, load.flange_a)
+    system = AcausalCompiler(ev, d)()
+    values = {"gear.ratio": 2.0, "motor.J": 0.5, "load.J": 3.0, "wanted.height": -1.8, "wanted.start_time": 1.0}
+    ts = np.array([0.5, 1.5, 3.0])
+    found, slopes = run_with_slopes(system, values, ts, ["motor.w"], ["motor.w"])
+
+    def reference(ratio, J, load, height, turns):
+        driven = 1.2 / (J + load / (0.9 * ratio**2))
+        driving = (1.2 + height) / (J + 0.8 * load / ratio**2)
+        return 4.0 + driven * np.minimum(ts, turns) + driving * np.maximum(ts - turns, 0.0)
+
+    np.testing.assert_allclose(found["motor.w"], reference(*values.values()), rtol=1e-7)
+    for name, by_hand in by_differences(reference, values).items():
+        assert slopes[name] == pytest.approx(by_hand, rel=1e-5), name
