@@ -280,7 +280,10 @@ def port_for_a_signal():
             lambda: series(0.0, 0.0),
             ("singular for r.R = 0, q.R = 0, though not in general. Give a value other than zero to r.R or q.R, or",),
         ),
-        (lambda: coupled(1.0), ("singular for coils.L1 = 1", "coils.M = 1", "coils.L2 = 1", "Change the parameters")),
+        (
+            lambda: coupled(1.0),
+            ("'coils': M² must be below L1·L2; got M=1 with L1=1 and L2=1", "take IdealTransformer"),
+        ),
         (
             boost,
             (
