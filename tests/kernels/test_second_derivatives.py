@@ -106,7 +106,7 @@ def test_reverse_mode_outside_says_what_to_write(twice, staged):
     """JAX's own errors spoke of `lax.while_loop` and of `custom_vjp`."""
 
     def end(a):
-        return solve_dae(diffrax.ODETerm(lambda t, y, a: -a * y), 0.0, 1.0, jnp.ones(1), a, ts=jnp.ones(1)).ys[0, 0]
+        return solve_dae(diffrax.ODETerm(lambda t, y, a: -a * y), 1.0, jnp.ones(1), args=a).ys[-1, 0]
 
     second = twice(end)
     with pytest.raises(ModelError, match=r"jax\.jacfwd\(jax\.grad\(f\)\)"):
