@@ -66,6 +66,17 @@ def is_forwards(tree: PyTree) -> bool:
     return not kinds.isdisjoint({"JVPTracer", LINEARIZED}) and "LinearizeTracer" not in kinds
 
 
+def is_reversed_outside(tree: PyTree) -> bool:
+    """True if reverse mode is at work on a leaf around another differentiation, as in `jax.grad(jax.grad(f))` and
+    `jax.grad(jax.jacfwd(f))`."""
+    for leaf in jax.tree.leaves(tree):
+        # The layer outside belongs to the differentiation inside, which began last.
+        kinds = [k for k in map(kind, layers(leaf)) if k in ("JVPTracer", "LinearizeTracer", LINEARIZED)]
+        if "LinearizeTracer" in kinds[1:]:
+            return True
+    return False
+
+
 LINEARIZED = "jax.linearize"
 
 

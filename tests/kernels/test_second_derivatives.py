@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxonomy_dae import ModelError
 from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, StoredAdjoint, Tsit5, consistent_start, solve_dae
 
 TS = jnp.array([0.5, 1.0])
@@ -97,3 +98,16 @@ def test_of_algebraic_unknowns(solver):
         return solve_dae(term, 1.0, y0, args=a, ts=jnp.array([0.5]), solver=solver, rtol=1e-8, atol=1e-8).ys[1][0, 0]
 
     np.testing.assert_allclose(jax.jit(jax.hessian(end))(10.0), -6 * 2 / 13**3, rtol=1e-9)
+
+
+@pytest.mark.parametrize("twice", [lambda f: jax.grad(jax.grad(f)), lambda f: jax.grad(jax.jacfwd(f))])
+@pytest.mark.parametrize("staged", [False, True])
+def test_reverse_mode_outside_says_what_to_write(twice, staged):
+    """JAX's own errors spoke of `lax.while_loop` and of `custom_vjp`."""
+
+    def end(a):
+        return solve_dae(diffrax.ODETerm(lambda t, y, a: -a * y), 1.0, jnp.ones(1), args=a).ys[-1, 0]
+
+    second = twice(end)
+    with pytest.raises(ModelError, match=r"jax\.jacfwd\(jax\.grad\(f\)\)"):
+        (jax.jit(second) if staged else second)(1.0)

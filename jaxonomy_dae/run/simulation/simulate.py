@@ -18,7 +18,7 @@ from ...base.errors import InitializationError, ModelError, SimulationError, exp
 from ...host.cache import PROGRAMS
 from ...host.members import batch_size, is_batched, say_of_members
 from ...host.rows import filled_up
-from ...host.staging import as_argument, as_array, is_forwards, is_staged, is_traced, on_device, picked
+from ...host.staging import as_argument, as_array, is_staged, is_traced, on_device, picked
 from ...solve.adjoint.stored_adjoint import default_adjoint
 from ...solve.methods import BDF, Rodas5P, Tsit5
 from ...solve.methods.causes import decay_at, is_stiff
@@ -298,7 +298,7 @@ class _Call:
         if steps is None:
             steps = controller_for(system, solver, self.rtol, self.atol, self.scaled, asked.dtmax, asked.control)
         if adjoint is None:
-            adjoint = default_adjoint(is_forwards(self.given), batch_size(self.given), self.known)
+            adjoint = default_adjoint(self.given, batch_size(self.given), self.known)
         return Options(
             solver=solver, adjoint=adjoint, controller=clipped(steps, asked.jump_ts, self.ends),
             max_steps=asked.max_steps + self.ends.count, progress=self.progress, max_events=self.bounds[1], room=room,

@@ -14,8 +14,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from ...base.aliases import PyTree, Solver, Terms
+from ...base.errors import ModelError
 from ...base.private_names import has_stored_adjoint, private
 from ...host.members import batch_size
+from ...host.staging import is_forwards, is_reversed_outside
 from .appended import NOTED, AbstractAppending, apart, together
 from .closure_conversion import SolveProgram, as_traced, by_itself_or_batched, closure_convert, unless_waiting
 from .ends import AttemptedStep, Ending
@@ -393,9 +395,20 @@ def forward_mode() -> Iterator[None]:
         _forward.reset(token)
 
 
-def default_adjoint(forwards: bool, members: int = 1, known: bool = False) -> diffrax.AbstractAdjoint:
-    """The adjoint where the user gives none. `forwards` is true if forward mode alone differentiates the arguments;
-    `members` is the size of the batch that they are; `known`, that all of them have values."""
-    if forwards or _forward.get():
+def default_adjoint(given: PyTree, members: int = 1, known: bool = False) -> diffrax.AbstractAdjoint:
+    """The adjoint of a run of the arguments `given` where the user names none. `members` is the size of the batch that
+    they are; `known`, that all of them have values.
+
+    **Raises:**
+
+    - `ModelError` for reverse mode around another differentiation: a record of steps goes back over a run, and nothing
+        goes back over that.
+    """
+    if is_reversed_outside(given):
+        raise ModelError(
+            "a run is differentiated in reverse mode around another differentiation, as by jax.grad(jax.grad(f)): "
+            "put the forward mode outside, as jax.hessian(f) and jax.jacfwd(jax.grad(f)) do"
+        )
+    if is_forwards(given) or _forward.get():
         return diffrax.ForwardMode()
     return StoredAdjoint(members, known) if has_stored_adjoint() else diffrax.RecursiveCheckpointAdjoint()

@@ -18,7 +18,7 @@ from ...base.errors import InitializationError, ModelError, SimulationError, exp
 from ...host.cache import PROGRAMS, compiled
 from ...host.members import is_batched, say_of_members
 from ...host.platform import precisely
-from ...host.staging import as_array, is_forwards, is_staged, is_traced
+from ...host.staging import as_array, is_staged, is_traced
 from ..adjoint.late_times import Integration
 from ..adjoint.stored_adjoint import default_adjoint
 from .bdf import BDF
@@ -125,7 +125,7 @@ def solve_dae(
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     ts = None if ts is None else jnp.asarray(ts, dtype)
     if adjoint is None:
-        adjoint = default_adjoint(is_forwards((term, t0, t1, y0, ts, args)))
+        adjoint = default_adjoint((term, t0, t1, y0, ts, args))
     of = _Given(term, t0, t1, y0, ts, args, (rtol, atol), solver, adjoint, stepsize_controller, max_steps)
     staged = is_staged(of)
     if staged:
