@@ -290,7 +290,8 @@ class Objective:
 
     def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
         """Residuals and Jacobian of the free coordinates, with their variances if the predictor says them; None where a
-        run that counts fails, or leads beyond what can be squared. Where errors are correlated, residuals are their innovations."""
+        run that counts fails, or leads beyond what can be squared. Where errors are correlated, residuals are their
+        innovations."""
         full = self.full(z)
         found, variance = self._differentiated(full, self.counted)
         c = self.coordinates
