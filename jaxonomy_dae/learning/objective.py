@@ -71,6 +71,8 @@ FINEST = 1e3  # roundings, to which an integration of some hundred steps can be 
 # still within reach, and what runs further is not held by the data.
 AWAY = 1e9
 FAR = AWAY**2  # the same of other numbers in units of their start, which may itself be next to nothing
+# Sums of a million squares of residuals, divided by noise of 1e-10, are below the largest float of double precision.
+LARGEST = 1e140
 FEW = 8  # columns up to which residuals alone cost almost as much as with their Jacobian, and a program of their own
 MANY = 40  # numbers of one experiment beyond which a gradient backwards costs less: of 97, 6 ms where forwards it is 14
 
@@ -288,7 +290,8 @@ class Objective:
 
     def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
         """Residuals and Jacobian of the free coordinates, with their variances if the predictor says them; None where a
-        run that counts fails. Where errors are correlated, residuals are their innovations."""
+        run that counts fails, or leads beyond what can be squared. Where errors are correlated, residuals are their
+        innovations."""
         full = self.full(z)
         found, variance = self._differentiated(full, self.counted)
         c = self.coordinates
@@ -303,7 +306,8 @@ class Objective:
                 parts += [np.where(s > 0, s, np.nan), slope[:, self.free]]
             elif self.rho.any():
                 parts = [self.colour.whitened(part) for part in parts]
-        return Evaluation(*parts) if all(np.isfinite(a).all() for a in parts) else None
+        # What is not a number is not below it, either.
+        return Evaluation(*parts) if all((np.abs(a) < LARGEST).all() for a in parts) else None
 
     def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
         """Residuals alone; None where a run that counts fails."""
