@@ -25,6 +25,9 @@ QUICK_COMPILES = (  # as the Makefile has it
 )
 
 
+FLAT_TEXTS = "tests/compiler/test_modelica_text.py tests/compiler/test_modelica_components.py"
+
+
 @dataclasses.dataclass(frozen=True)
 class Fault:
     """In `file`, the only occurrence of `right` becomes `wrong`; one of `tests` must fail, of `make test` if it may."""
@@ -130,31 +133,31 @@ FAULTS = [
         "write/discrete_equations.py",
         "*(Assign(self.before(m.path), n) for m, n in new.items()),",
         "",
-        "tests/compiler/test_modelica_text.py tests/plants/test_discrete_equations.py",
+        f"{FLAT_TEXTS} tests/plants/test_discrete_equations.py",
     ),
     Fault(
         "write/discrete_equations.py",
         "goes_on = functools.reduce(either, moves, self.phase(AT_FIRST))",
         "goes_on = self.phase(AT_FIRST)",
-        "tests/compiler/test_modelica_text.py tests/plants/test_discrete_equations.py",
+        f"{FLAT_TEXTS} tests/plants/test_discrete_equations.py",
     ),
     Fault(
         "write/discrete_equations.py",
         "        replaced |= new",
         "        replaced |= {}",
-        "tests/compiler/test_modelica_text.py tests/plants/test_discrete_equations.py",
+        f"{FLAT_TEXTS} tests/plants/test_discrete_equations.py",
     ),
     Fault(
         "write/discrete_equations.py",
         'acts = self._truth("acts", both(rises, negated(before)))',
         'acts = self._truth("acts", rises)',
-        "tests/compiler/test_modelica_text.py tests/plants/test_modelica_texts.py",
+        f"{FLAT_TEXTS} tests/plants/test_modelica_texts.py",
     ),
     Fault(
         "write/discrete_equations.py",
         "rises = both(now, plain(sympy.Eq(was, 0)))",
         "rises = now",
-        "tests/compiler/test_modelica_text.py tests/plants/test_modelica_texts.py",
+        f"{FLAT_TEXTS} tests/plants/test_modelica_texts.py",
     ),
     Fault(
         "compile/diagnosis/wording.py",
@@ -251,7 +254,7 @@ FAULTS = [
         "modelica/operations.py",
         "_relation(lambda a, b: a <= b",
         "_relation(lambda a, b: a < b",
-        "tests/compiler/test_modelica_text.py tests/compiler/test_modelica_library.py tests/plants/test_modelica.py",
+        f"{FLAT_TEXTS} tests/compiler/test_modelica_library.py tests/plants/test_modelica.py",
     ),
     Fault(
         "fmi/elementwise.py",

@@ -1,5 +1,14 @@
 """Flat Modelica models that tests share, written by hand in Base Modelica."""
 
+from jaxonomy_dae import EqnEnv
+from jaxonomy_dae.modelica import FlatComponent, load
+
+
+def built(text: str) -> FlatComponent:
+    """The component of a text."""
+    return FlatComponent(EqnEnv(), "m", load(text))
+
+
 BALL = """//! base 0.1.0
 package 'Ball'
   model 'Ball' "a ball that bounces"

@@ -66,10 +66,10 @@ def _pad(body: Writer, params: Params, given: Sequence[Value], results: Sequence
             body.line(f"{out.at('p')} = {filling.text};")
     with body.loops(source.kind.shape) as i:
         at, tests = [], []
-        for k, (low, _, inside), n in zip(i, params["padding_config"], out.kind.shape, strict=True):
-            place = affine(k, inside + 1, low)
+        for k, (low, high, between), n in zip(i, params["padding_config"], out.kind.shape, strict=True):
+            place = affine(k, between + 1, low)
             at.append(place)
-            if low < 0 or _ < 0:
+            if low < 0 or high < 0:
                 tests.append(f"{place} >= 0 && {place} < {n}")
         line = f"{out.at(flat(at, out.kind.shape))} = {source.at(flat(i, source.kind.shape))};"
         body.line(f"if ({' && '.join(tests)}) {line}" if tests else line)

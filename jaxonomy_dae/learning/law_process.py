@@ -12,14 +12,13 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from .law_changes import Bumps, answers, slopes_by_heights
-from .laws.properties import Property, raw
+from .laws.properties import Property, is_raw, raw
 from .process import Kernel, Process
 from .smoothness import spread_out
 
@@ -49,7 +48,7 @@ class LawProcess:
         module = estimate.system.neural[name]
         seen = o.seen(estimate.point)[name]
         seen = asked(module, seen[np.isfinite(seen).all(axis=1)])
-        if type(raw(module)) is not eqx.nn.MLP or len(seen) < 2:
+        if not is_raw(module) or len(seen) < 2:
             return None
         places = spread_out(seen)
         low, high = seen.min(axis=0), seen.max(axis=0)

@@ -28,6 +28,7 @@ from .descent import AbstractMerit, Minimum, descend
 from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
+from .laws.properties import is_raw
 from .least_squares import SumOfSquares
 from .likelihood import Likelihood, Scoring
 from .noise import Tails
@@ -71,14 +72,16 @@ FINEST = 1e3  # roundings, to which an integration of some hundred steps can be 
 # still within reach, and what runs further is not held by the data.
 AWAY = 1e9
 FAR = AWAY**2  # the same of other numbers in units of their start, which may itself be next to nothing
+# Sums of a million squares of residuals, divided by noise of 1e-10, are below the largest float of double precision.
+LARGEST = 1e140
 FEW = 8  # columns up to which residuals alone cost almost as much as with their Jacobian, and a program of their own
 MANY = 40  # numbers of one experiment beyond which a gradient backwards costs less: of 97, 6 ms where forwards it is 14
 
 
-# The precision with which a search begins where the evidence chooses it, beside that of weights as large as those
-# drawn. It stays as long as residuals are large. At 1, four of fourteen searches for a spring with a gap, and all with
-# 32 units in one layer, ended at a χ² of 430 of 190, from where a weaker prior led on to 187. At 0.1, none does; at
-# 0.01, one for a drag took 40 CPU s, by laws that steepen on the way.
+# The precision with which a search for a raw network begins where the evidence chooses it, beside that of weights as
+# large as those drawn. It stays as long as residuals are large. At 1, four of fourteen searches for a spring with a
+# gap, and all with 32 units in one layer, ended at a χ² of 430 of 190, from where a weaker prior led on to 187. At 0.1,
+# none does; at 0.01, one for a drag took 40 CPU s, by laws that steepen on the way.
 LOOSE = 0.1
 DOUBTED = 0.02  # the probability of χ² below which a fit goes on from another start: that at which it is not `ok`
 
@@ -288,7 +291,8 @@ class Objective:
 
     def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
         """Residuals and Jacobian of the free coordinates, with their variances if the predictor says them; None where a
-        run that counts fails. Where errors are correlated, residuals are their innovations."""
+        run that counts fails, or leads beyond what can be squared. Where errors are correlated, residuals are their
+        innovations."""
         full = self.full(z)
         found, variance = self._differentiated(full, self.counted)
         c = self.coordinates
@@ -303,7 +307,8 @@ class Objective:
                 parts += [np.where(s > 0, s, np.nan), slope[:, self.free]]
             elif self.rho.any():
                 parts = [self.colour.whitened(part) for part in parts]
-        return Evaluation(*parts) if all(np.isfinite(a).all() for a in parts) else None
+        # What is not a number is not below it, either.
+        return Evaluation(*parts) if all((np.abs(a) < LARGEST).all() for a in parts) else None
 
     def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
         """Residuals alone; None where a run that counts fails."""
@@ -522,8 +527,8 @@ class Objective:
         return () if self.near is not None else tuple(np.isin(places, law.columns) for law in self.laws)
 
     def weights(self, z: Float[np.ndarray, " f"], found: Evaluation, loose: float = 1.0) -> Weights:
-        """The first weights: priors, those that the evidence chooses `loose` times as precise as weights are large, and
-        noise levels that are known, as large as residuals, or by the variances."""
+        """The first weights: priors, those that the evidence chooses as precise as weights are large, of raw networks
+        `loose` times as precise; and noise levels that are known, as large as residuals, or by the variances."""
         s, c, experiment = self.stacked, self.coordinates, self.rows[0]
         sigma = s.sigma[self.rows]
         row = np.sqrt(s.weight[experiment]) / np.where(np.isnan(sigma), 1.0, sigma)
@@ -536,7 +541,10 @@ class Objective:
                 # The sizes of the weights that the problem came with; if all are zero, of order one.
                 size = float(np.sum(c.centre[self.free][group] ** 2))
                 first = group.sum() / size if size > 0 else 1.0
-                precision[group] = loose * first if given == "evidence" else float(given)
+                # Of other modules, the size of the law is the user's: with a tenth of the precision, a factor of an
+                # outflow near one led to runs that ended beyond the data.
+                first *= loose if is_raw(self.system.neural.get(name)) else 1.0
+                precision[group] = first if given == "evidence" else float(given)
                 if given == "evidence" and self.near is not None:
                     mean[group] = self.near[group]
         first = Weights(row, precision, mean, np.sqrt(s.weight[experiment]), tails=self.tails)

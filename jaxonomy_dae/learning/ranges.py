@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .coordinates import Shifts
-from .laws.properties import Property, raw
+from .laws.properties import Property, is_raw, raw
 from .objective import Objective
 from .program import weights_of
 
@@ -76,8 +76,8 @@ def in_ranges(
 
 def _places(objective: Objective, name: str) -> Int[np.ndarray, " w"] | None:
     """The coordinates of a raw network whose prior the evidence chooses; None for all others."""
-    net, c = raw(objective.system.neural[name]), objective.coordinates
-    if type(net) is not eqx.nn.MLP or len(net.layers) < 2 or objective.penalties.get(name) != "evidence":
+    whole, c = objective.system.neural[name], objective.coordinates
+    if not is_raw(whole) or len(raw(whole).layers) < 2 or objective.penalties.get(name) != "evidence":
         return None
     at = np.flatnonzero(np.array([group == name for group in c.group]) & c.is_weight)
     # Bounds are those of the numbers themselves, and not of what biases are at the centre.

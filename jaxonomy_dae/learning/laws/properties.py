@@ -65,3 +65,9 @@ class AlongInput(Property):
 def raw(network: Any) -> Any:
     """The network inside a property."""
     return network.network if isinstance(network, Property) else network
+
+
+def is_raw(network: Any) -> bool:
+    """True for an `equinox.nn.MLP`, also inside a property. Searches measure its weights by ranges; modules of a user's
+    own bring their scales along."""
+    return type(raw(network)) is eqx.nn.MLP
