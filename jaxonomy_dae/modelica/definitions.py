@@ -65,8 +65,8 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
     types = {d.name: d.type for d in model.declarations}
     candidates = [(s, _definable(s, is_discrete, given, types)) for s in [*others, *bindings]]
     equations: list[tree.Statement] = [s for s, sides in candidates if not sides]
-    matched, left = _matched([(s, sides) for s, sides in candidates if sides], is_discrete)
-    of: dict[str, tree.Expression | int] = {**matched}
+    found, left = matched([(s, sides) for s, sides in candidates if sides], is_discrete)
+    of: dict[str, tree.Expression | int] = {**found}
     equations += left
     assigned = []
     for k, section in enumerate(algorithms):
@@ -169,7 +169,7 @@ def _definable(
     return out
 
 
-def _matched(
+def matched(
     candidates: list[tuple[tree.Statement, list[tuple[str, tree.Expression]]]], is_discrete: Callable[[str], bool]
 ) -> tuple[dict[str, tree.Expression], list[tree.Statement]]:
     """(One equation for each variable, by augmenting paths; equations that are left, of continuous variables)."""

@@ -93,7 +93,9 @@ class Library:
         # Records are read from the sources only if the front end misses equations: it takes a search through files.
         try:
             return opened(
-                name, flattened(self.front_end, name, changes, source, functools.partial(self._records, name, source))
+                name,
+                flattened(self.front_end, name, changes, source, functools.partial(self._records, name, source)),
+                self._names,
             )
         except Unbalanced as error:
             found = self._names.find(name) if source is None else None

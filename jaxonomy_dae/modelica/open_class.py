@@ -14,8 +14,11 @@ from . import tree
 from .boundaries import Closed, without_boundaries
 from .external_objects import with_external_objects
 from .flat_model import FlatModel
+from .kept_inputs import with_starts_of_inputs
+from .model_algorithms import with_algorithms
 from .read_rumoca import read_open
 from .rumoca_expressions import Json
+from .sources import Sources
 
 AS_TEXT = (
     "a part of a model that has such connectors inside opens as a whole: write it as a Modelica text with plain "
@@ -67,8 +70,8 @@ class OpenClass:
     roots: tuple[str, ...] = ()
 
 
-def opened(name: str, closed: Closed) -> OpenClass:
-    """A class with open connectors, from its flattening.
+def opened(name: str, closed: Closed, sources: Sources) -> OpenClass:
+    """A class with open connectors, from its flattening and the libraries that it belongs to.
 
     **Raises:**
 
@@ -82,7 +85,7 @@ def opened(name: str, closed: Closed) -> OpenClass:
     # A connector with streams was connected to a boundary, and has no equation that closes it.
     flows = [f"{port.name}.{flow}" for port in ports for flow, _ in port.flows if not port.streams]
     flat = with_external_objects(read_open(found.dae, name.rpartition(".")[2], flows), found.flat)
-    flat = without_boundaries(flat, closed.outer)
+    flat = with_starts_of_inputs(with_algorithms(without_boundaries(flat, closed.outer), sources))
     storage = found.dae["storage"]
     tunable, required, fixed = [], [], []
     roles: dict[str, list[str]] = {"input": [], "output": []}

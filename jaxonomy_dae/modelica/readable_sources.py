@@ -20,9 +20,11 @@ from ..host.kept import folder_of
 from .boolean_connections import with_single_connections
 from .complex_sources import with_real_equations
 from .kept_files import contents, write
+from .kept_inputs import with_kept_inputs
+from .model_algorithms import without_algorithms
 from .sources import Sources
 
-_FORMAT = 3  # to be raised with every change of what is changed in sources
+_FORMAT = 7  # to be raised with every change of what is changed in sources
 _LOOK_UP = "getTable1DValue"
 # parameter Type name(modifiers) = binding "comment";
 _BOUND = re.compile(
@@ -66,6 +68,8 @@ def _changed(root: Path, sources: Sources) -> Iterator[tuple[str, str]]:
     for file in sorted(root.rglob("*.mo")):
         text = file.read_text(encoding="utf-8-sig", errors="replace")
         new = _by_initial_equations(text) if _LOOK_UP in text else text
+        new = without_algorithms(sources, new)
+        new = with_kept_inputs(sources, new)
         new = with_real_equations(sources, new)
         new = with_single_connections(sources, new)
         if new != text:

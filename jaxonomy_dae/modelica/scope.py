@@ -20,6 +20,7 @@ from ..write.component import Component
 from ..write.discrete_equations import BEFORE, STARTED, DiscreteEquations
 from ..write.events import terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
+from .clocked import SAMPLED
 from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter
@@ -65,7 +66,7 @@ class Scope:
         self.being: list[str] = []
         special: dict[str, Callable[..., Value]] = {
             "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self._is_initial,
-            "terminal": lambda: False, "sample": self._sample, "delay": _delay,
+            "terminal": lambda: False, "sample": self._sample, SAMPLED: self._sampled, "delay": _delay,
         }  # fmt: skip
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
         special |= {name: functools.partial(_clocked, name) for name in _CLOCKED if name not in flat.classes}
@@ -437,6 +438,15 @@ class Scope:
 
     def _sample(self, start: Expression, interval: Expression) -> Value:
         return self.discrete.tick(self.component.sampled(self.evaluate(interval), self.evaluate(start)))
+
+    def _sampled(self, e: Expression, start: Expression, interval: Expression) -> Value:
+        """A value before the ticks of a clock."""
+        clock = self.component.sampled(self.evaluate(interval), self.evaluate(start))
+        value = self.evaluate(e)
+        if isinstance(value, list | Record):
+            raise ModelError("sample of an array as a whole is not read: sample its entries")
+        found = self.discrete.at_ticks(clock, sympy.sympify(as_number(value)))
+        return sympy.Eq(found, 1) if is_condition(value) else found
 
 
 def _is_of_parameters(value: sympy.Expr) -> bool:

@@ -30,10 +30,15 @@ class Following(Protocol):
 
 
 class KeptRelations:
-    """The relations of a component whose truth is kept; those of `quiet` are not."""
+    """The relations of a component whose truth is kept; those of `quiet` are not.
+
+    - `times`: whether those in time alone are kept in all equations, too: what is sampled is then what was before one
+      of them turned at the instant.
+    """
 
     def __init__(self, component: Following, quiet: Collection[Condition]):
         self.component, self.quiet = component, quiet
+        self.times = False
         self.forms: dict[Condition, Condition] = {}
         self.variables: dict[Expression, Expression] = {}
 
@@ -54,9 +59,10 @@ class KeptRelations:
 
     def in_equations(self, expression: Expression) -> Expression:
         """An expression with relations that discrete equations read replaced by their kept truths."""
-        if not self.forms:
+        if not (self.forms or self.times):
             return expression
-        found = {r: self._form(r) for r in expression.atoms(*_ORDER) if self._known(r)}
+        relations = [r for r in expression.atoms(*_ORDER) if self._known(r) or self.times and _is_of_time(r)]
+        found = {r: self._form(r) for r in sorted(relations, key=str)}
         return exchanged(expression, found) if found else expression
 
     def with_jumps_as_variables(self, value: Truth) -> Truth:
