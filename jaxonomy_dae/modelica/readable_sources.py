@@ -24,7 +24,7 @@ from .kept_inputs import with_kept_inputs
 from .model_algorithms import without_algorithms
 from .sources import Sources
 
-_FORMAT = 7  # to be raised with every change of what is changed in sources
+_FORMAT = 4  # to be raised with every change of what is changed in sources
 _LOOK_UP = "getTable1DValue"
 # parameter Type name(modifiers) = binding "comment";
 _BOUND = re.compile(

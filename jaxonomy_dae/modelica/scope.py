@@ -18,13 +18,13 @@ from ..graph.expressions.from_sympy import symbols_of
 from ..write.choices import exchanged
 from ..write.component import Component
 from ..write.discrete_equations import BEFORE, STARTED, DiscreteEquations
-from ..write.events import terminate
+from ..write.events import Sampled, terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
 from .clocked import SAMPLED
 from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter
-from .left_out import LEFT_OUT
+from .left_out import LEFT_OUT, TIME_TABLE, time_table_coefficients
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
@@ -69,6 +69,7 @@ class Scope:
             "terminal": lambda: False, "sample": self._sample, SAMPLED: self._sampled, "delay": _delay,
         }  # fmt: skip
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
+        special[TIME_TABLE] = self._time_table
         special |= {name: functools.partial(_clocked, name) for name in _CLOCKED if name not in flat.classes}
         self.random = RandomNumbers(component)
         self.interpreter = Interpreter(
@@ -394,6 +395,15 @@ class Scope:
         finally:
             self.as_numbers = False
 
+    def _time_table(self, table: Expression, *others: Expression) -> Value:
+        """The line of a time table at an event; the entries of the table, which say when events are, are numbers."""
+        self.as_numbers = True
+        try:
+            entries = self.evaluate(table)
+        finally:
+            self.as_numbers = False
+        return time_table_coefficients(entries, *map(self.evaluate, others))
+
     def _read_table(self, read: Callable[..., Value], table: Table, column: int, u: Value, *more: Value) -> Value:
         """The value of a table. One without extrapolation ends the run where it is read outside of its rows."""
         outside = table.outside(u) if isinstance(u, sympy.Expr) else False
@@ -443,8 +453,11 @@ class Scope:
         """A value before the ticks of a clock."""
         clock = self.component.sampled(self.evaluate(interval), self.evaluate(start))
         value = self.evaluate(e)
-        if isinstance(value, list | Record):
-            raise ModelError("sample of an array as a whole is not read: sample its entries")
+        return self._before_ticks(clock, value)
+
+    def _before_ticks(self, clock: Sampled, value: Value) -> Value:
+        if isinstance(value, list):
+            return [self._before_ticks(clock, v) for v in value]
         found = self.discrete.at_ticks(clock, sympy.sympify(as_number(value)))
         return sympy.Eq(found, 1) if is_condition(value) else found
 

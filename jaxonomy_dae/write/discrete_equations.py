@@ -119,7 +119,6 @@ class DiscreteEquations:
         if (clock, value) not in self._sampled:
             self.tick(clock)
             before = self._sampled[clock, value] = self.unshown(f":sampled[{len(self._sampled)}]", 0.0)
-            self.kept.times = True
             # Events of one instant all read the values before it.
             self.component._event(clock, (Assign(before, self.kept.in_discrete(value)),), None, NO_FLAG)
         return self._sampled[clock, value]

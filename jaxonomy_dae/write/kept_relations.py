@@ -30,15 +30,10 @@ class Following(Protocol):
 
 
 class KeptRelations:
-    """The relations of a component whose truth is kept; those of `quiet` are not.
-
-    - `times`: whether those in time alone are kept in all equations, too: what is sampled is then what was before one
-      of them turned at the instant.
-    """
+    """The relations of a component whose truth is kept; those of `quiet` are not."""
 
     def __init__(self, component: Following, quiet: Collection[Condition]):
         self.component, self.quiet = component, quiet
-        self.times = False
         self.forms: dict[Condition, Condition] = {}
         self.variables: dict[Expression, Expression] = {}
 
@@ -59,10 +54,9 @@ class KeptRelations:
 
     def in_equations(self, expression: Expression) -> Expression:
         """An expression with relations that discrete equations read replaced by their kept truths."""
-        if not (self.forms or self.times):
+        if not self.forms:
             return expression
-        relations = [r for r in expression.atoms(*_ORDER) if self._known(r) or self.times and _is_of_time(r)]
-        found = {r: self._form(r) for r in sorted(relations, key=str)}
+        found = {r: self._form(r) for r in expression.atoms(*_ORDER) if self._known(r)}
         return exchanged(expression, found) if found else expression
 
     def with_jumps_as_variables(self, value: Truth) -> Truth:
