@@ -276,7 +276,7 @@ def without_boundaries(model: FlatModel, outer: frozenset[str]) -> FlatModel:
     initial = tuple(e for e in own.initial_equations if not any(n.startswith(RIM) or n in gone for n in _names(e)))
     left = own._replace(
         declarations=declarations,
-        equations=tuple(e for e in own.equations if id(e) in chosen),
+        equations=tuple(e for e, _ in equations if id(e) in chosen),
         initial_equations=initial,
     )
     return dataclasses.replace(model, model=left)

@@ -127,9 +127,7 @@ class Library:
         """The inputs and outputs of a class of the roots."""
         found = self._names.find(name) if source is None else None
         if not isinstance(found, Found):
-            raise ModelError(
-                f"'{name}': clock=… is for classes of the roots; a text of source=… has its own clock"
-            )
+            raise ModelError(f"'{name}': clock=… is for classes of the roots; a text of source=… has its own clock")
         return list(signals_of(self._names, found))
 
     def _records(self, name: str, source: str | None) -> dict[str, bool]:

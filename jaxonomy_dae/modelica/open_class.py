@@ -14,6 +14,7 @@ from . import tree
 from .boundaries import Closed, without_boundaries
 from .external_objects import with_external_objects
 from .flat_model import FlatModel
+from .held_outputs import with_held_outputs
 from .kept_inputs import with_starts_of_inputs
 from .model_algorithms import with_algorithms
 from .read_rumoca import read_open
@@ -87,6 +88,8 @@ def opened(name: str, closed: Closed, sources: Sources) -> OpenClass:
     flat = with_external_objects(read_open(found.dae, name.rpartition(".")[2], flows), found.flat)
     flat = with_starts_of_inputs(with_algorithms(without_boundaries(flat, closed.outer), sources))
     storage = found.dae["storage"]
+    given = [v["name"] for v in storage["variables"] if v["attributes"]["causality"] == "output"]
+    flat = with_held_outputs(flat, [n for n in given if "." not in n])
     tunable, required, fixed = [], [], []
     roles: dict[str, list[str]] = {"input": [], "output": []}
     declared = {d.name: d for d in flat.model.declarations}
