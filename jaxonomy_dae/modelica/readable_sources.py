@@ -2,8 +2,9 @@
 
 rumoca 0.10.2 takes a parameter that is bound to a look-up in a table for an unknown with an equation, so that Clutch,
 Brake and OneWayClutch of the Modelica library have one equation too many. In the copy, an initial equation gives such a
-parameter its value. `complex_sources` says what it does not read of complex numbers. Folders without such files are
-links to the originals, and no line moves.
+parameter its value. It asks for the instants of `sample` before a run begins: a parameter that is the initial time is
+zero in the copy, where runs begin. `complex_sources`, `boolean_connections`, `kept_inputs` and `model_algorithms` say
+what else it does not read. Folders without such files are links to the originals, and no line moves.
 """
 
 import contextlib
@@ -30,6 +31,13 @@ _LOOK_UP = "getTable1DValue"
 _BOUND = re.compile(
     r"\bparameter\s+(?P<type>[\w.]+)\s+(?P<name>\w+)\s*(?P<modifiers>\([^();]*\))?\s*="
     r"(?P<binding>[^;\"]*\bgetTable1DValue\w*\s*\([^;\"]*)(?P<comment>\"[^\"]*\"\s*)?;"
+)
+# parameter Type name(fixed = false) …; initial equation … name = time;
+_START = re.compile(
+    r"(?P<declared>\bparameter\s+[\w.]+\s+(?P<name>\w+)\s*)\(\s*fixed\s*=\s*false\s*\)"
+    r"(?P<between>(?:(?!\b(?:end|model|block|class)\s+\w+).)*?\binitial\s+equation\b"
+    r"(?:(?!\b(?:end|equation|algorithm)\b).)*?)\b(?P=name)\s*=\s*time\s*;",
+    re.S,
 )
 _EQUATIONS = re.compile(r"^[ \t]*equation\b", re.M)
 
@@ -68,6 +76,7 @@ def _changed(root: Path, sources: Sources) -> Iterator[tuple[str, str]]:
     for file in sorted(root.rglob("*.mo")):
         text = file.read_text(encoding="utf-8-sig", errors="replace")
         new = _by_initial_equations(text) if _LOOK_UP in text else text
+        new = _START.sub(r"\g<declared> = 0\g<between>", new)
         new = without_algorithms(sources, new)
         new = with_kept_inputs(sources, new)
         new = with_real_equations(sources, new)
