@@ -103,8 +103,8 @@ class Library:
                 closed = with_clock(self.front_end, name, changes, source, signals, float(clock))
             except Unclocked as error:
                 raise ModelError(
-                    f"'{name}': one clock does not say when all of its clocks tick; parameters of the class may say how "
-                    f"they are related, as inferFactor=False, factor=2 do: {error}"
+                    f"'{name}': one clock does not say when all of its clocks tick; parameters of the class may say "
+                    f"how they are related, as inferFactor=False, factor=2 do: {error}"
                 ) from None
             return opened(name, closed, self._names)
         # Records are read from the sources only if the front end misses equations: it takes a search through files.
