@@ -6,7 +6,8 @@ A clocked variable has a value at the ticks of its clock, which it keeps in betw
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 from ..base.errors import ModelError
 from . import tree
@@ -34,7 +35,9 @@ def with_clocked_equations(
             sampled.add(name)
     if not clocks:
         return [], list(equations)
-    candidates = [(e, _sides(e, clocks)) for e in equations]
+    # Of Boolean and Integer variables, rumoca says which equation determines them: their sides are not exchanged.
+    owned = {v["name"] for v in of.variables if v["role"] == "discrete_value"}
+    candidates = [(e, _sides(e, clocks, owned)) for e in equations]
     others = [e for e, sides in candidates if not sides]
     values, left = matched([each for each in candidates if each[1]], lambda name: _whole(name) in clocks)
     if left:
@@ -43,20 +46,23 @@ def with_clocked_equations(
     bodies: dict[int, list[tree.Statement]] = {}
     for name, value in values.items():
         clock = clocks[_whole(name)]
-        if _whole(name) in sampled and not _is_before(value):
-            value = tree.Call(SAMPLED, (value, *of.clock(clock).arguments), ())
+        if _whole(name) in sampled:
+            value = tree.Call(SAMPLED, (_at_present(value, clocks), *of.clock(clock).arguments), ())
         bodies.setdefault(clock, []).append(tree.Equality(tree.Reference((name,)), value, lines[name]))
     whens = [tree.Branches("when", ((of.clock(clock), tuple(body)),), body[0].line) for clock, body in bodies.items()]
     return whens, others
 
 
-def _sides(e: tree.Statement, clocks: dict[str, int]) -> list[tuple[str, tree.Expression]]:
+def _sides(e: tree.Statement, clocks: Mapping[str, int], owned: Collection[str]) -> list[tuple[str, tree.Expression]]:
     """The clocked variables that an equation can determine, each with its value."""
     if not isinstance(e, tree.Equality):
         return []
+    pairs = [(e.left, e.right), (e.right, e.left)]
+    if isinstance(e.left, tree.Reference) and _whole(e.left.path) in owned:
+        pairs = pairs[:1]
     return [
         (_name(side), other)
-        for side, other in ((e.left, e.right), (e.right, e.left))
+        for side, other in pairs
         if isinstance(side, tree.Reference) and _whole(side.path) in clocks
     ]
 
@@ -71,6 +77,12 @@ def _whole(name: str) -> str:
     return re.sub(r"\[[\d,]+\]$", "", name)
 
 
-def _is_before(value: tree.Expression) -> bool:
-    """True for a value that rumoca has written by `pre` already, as it does for Boolean and Integer ones."""
-    return isinstance(value, tree.Call) and value.function == "pre"
+def _at_present(e: Any, clocks: Mapping[str, int]) -> Any:
+    """A sampled value without the `pre` that rumoca writes around what is Boolean or Integer in it."""
+    if isinstance(e, tree.Call) and e.function == "pre":
+        (of,) = e.arguments
+        return of if isinstance(of, tree.Reference) and _whole(of.path) not in clocks else e
+    if isinstance(e, tuple):
+        parts = [_at_present(part, clocks) for part in e]
+        return type(e)(*parts) if hasattr(e, "_fields") else tuple(parts)
+    return e

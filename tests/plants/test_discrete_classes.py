@@ -110,6 +110,20 @@ package Marks
     y = sample(u);
   end Sample;
 
+  block SampleTruth
+    BooleanInput u;
+    BooleanOutput y;
+  equation
+    y = sample(u);
+  end SampleTruth;
+
+  block HoldTruth
+    BooleanInput u;
+    BooleanOutput y;
+  equation
+    y = hold(u);
+  end HoldTruth;
+
   block SampleByClock
     RealInput u;
     ClockInput clock;
@@ -246,8 +260,11 @@ def test_clocks(library):
     ticks = library.component("Marks.Ticks", clock=0.25)(ev, "ticks")
     one = library.component("Marks.Sample", clock=0.25)(ev, "one")
     two = library.component("Marks.SampleByClock", clock=0.25)(ev, "two")
+    truths = [library.component(f"Marks.{n}Truth", clock=0.25)(ev, n) for n in ("Sample", "Hold")]
+    turn = Step(ev, "turn", start_time=0.4)
     loop, lag, step = library["Marks.Loop"](ev, "loop"), FirstOrder(ev, "lag", T=1.0), Constant(ev, "step", 1.0)
-    d.add(ticks, one, two, loop, lag, step)
+    d.add(ticks, one, two, loop, lag, step, turn, *truths)
+    d.connect(turn.y, *(t.u for t in truths))
     d.connect(step.y, lag.u)
     d.connect(lag.y, one.u, two.u)
     ts = jnp.array([0.1, 0.3, 0.6, 0.8])
@@ -255,5 +272,6 @@ def test_clocks(library):
     assert s["ticks.y"].tolist() == [1, 2, 3, 4]
     for name in ("one.y", "two.y"):
         np.testing.assert_allclose(s[name], 1.0 - np.exp(-np.floor(np.asarray(ts) / 0.25) * 0.25), atol=1e-8)
+    assert s["Sample.y"].tolist() == s["Hold.y"].tolist() == [0, 0, 1, 1]
     assert s["loop.count"].tolist() == [6, 7, 8, 9]
     assert s["loop.late"].tolist() == [0, 0, 0, 1]
