@@ -25,7 +25,7 @@ _DECIDES = re.compile(
 )
 _UNCLOCKED = re.compile(
     r"unresolved clock schedule|no exact connected clock owner|no inferred clock constructor"
-    r"|must belong to a proven clock partition|requires an owning clocked when-clause"
+    r"|must belong to a proven clock partition|the required exact clock owner|requires an owning clocked when-clause"
 )
 _NOT_LOADED = re.compile(r"Failed to load source root")
 _CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")

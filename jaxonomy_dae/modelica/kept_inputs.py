@@ -50,8 +50,7 @@ def _of_calls(kept: Mapping[str, object], marked: Marked, begin: int, end: int) 
 
 
 def kept_inputs(sources: Sources, of: Found) -> dict[str, tuple[tree.Declaration, str]]:
-    """The inputs of a class whose values before an event its own sections read, and their types. What is Real has a
-    limit at an event, which no variable keeps."""
+    """The inputs of a class whose values before an event its own sections read, and their types."""
     own = of.source
     statements = own.equations, own.initial_equations, own.algorithms, own.initial_algorithms
     read = {
@@ -70,10 +69,10 @@ def kept_inputs(sources: Sources, of: Found) -> dict[str, tuple[tree.Declaration
 
 
 def _kind(sources: Sources, d: tree.Declaration, scopes: tuple[Found, ...]) -> str | None:
-    """The type of an input that is not Real; None for what is none."""
+    """The type of an input; None for what is none."""
     is_input = "input" in d.prefixes
     name = d.type
-    while name not in ("Boolean", "Integer"):
+    while name not in ("Boolean", "Integer", "Real"):
         found = sources.class_of(name, scopes)
         if found is None:
             return None

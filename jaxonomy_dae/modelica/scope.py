@@ -24,6 +24,7 @@ from .clocked import SAMPLED
 from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter
+from .kept_inputs import KEPT
 from .left_out import LEFT_OUT, TIME_TABLE, time_table_coefficients
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
@@ -51,6 +52,7 @@ class Scope:
     - `carried_out`: what algorithms assign, by their numbers.
     - `said`: the discrete variables of which initial equations say what they are. `waiting`: initial equations of
       discrete variables that wait for others, which they do while `postpones` is true.
+    - `clock`: the clock of the body of a `when` that is being read, if nothing else lets it act.
     - `as_numbers`: True while parameters are read as their values, which are final then.
     """
 
@@ -81,6 +83,7 @@ class Scope:
         self.discrete = DiscreteEquations(component, self.interpreter.quieted)
         self.kept = self.discrete.kept
         self.as_numbers = False
+        self.clock: Sampled | None = None
         self.final: dict[str, Value] = {}
         # Only now: sizes may depend on parameters, records and functions, which the interpreter finds by their names.
         self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
@@ -419,12 +422,15 @@ class Scope:
 
     def _pre(self, e: Expression) -> Value:
         value = self.evaluate(e)
+        if self.clock is not None and _variables(value):
+            return self._before_ticks(self.clock, value)
         for s in _variables(value):
             # A state jumps by `reinit` alone, at the end of an iteration: until then it is what it was before.
             if not s.path.startswith(":") and s.path not in self.states:
+                name = s.path.replace(KEPT, "")
                 raise ModelError(
-                    f"pre({s.path}): '{s.path}' is neither discrete nor a state, and may jump with others at the "
-                    f"instant: what it was before is not kept. Write pre(…) of what its equation reads"
+                    f"pre({name}): '{name}' is neither discrete nor a state, and may jump with others at the instant: "
+                    "what it was before is not kept. Write pre(…) of what its equation reads"
                 )
         return previous(value)
 

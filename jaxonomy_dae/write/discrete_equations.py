@@ -16,7 +16,7 @@ not in the iteration before, and pre(m) otherwise (sections 8.3.5 and 11.2.7).
 
 import functools
 import graphlib
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import sympy
@@ -113,6 +113,11 @@ class DiscreteEquations:
             tick = self.ticks[clock] = self.unshown(f":tick[{len(self.ticks)}]", 0.0)
             self.component._event(clock, (Assign(tick, sympy.Integer(1)),), None, NO_FLAG)
         return both(sympy.Eq(self.ticks[clock], 1), self.phase(STARTED))
+
+    def clock_of(self, conditions: Sequence[Truth]) -> Sampled | None:
+        """The clock at whose ticks alone one of some conditions becomes true; None if there are several or others."""
+        found = [c for c, tick in self.ticks.items() if any(tick in sympy.sympify(t).free_symbols for t in conditions)]
+        return found[0] if len(found) == 1 and all(map(self._is_tick, conditions)) else None
 
     def at_ticks(self, clock: Sampled, value: Expression) -> DiscreteSymbol:
         """A value as it is before anything happens at a tick, and at the initial time when that has settled."""

@@ -117,6 +117,17 @@ package Marks
     y = sample(u);
   end SampleTruth;
 
+  block Delay "By one tick"
+    RealInput u;
+    RealOutput y(start = -1, fixed = true);
+  protected
+    Boolean ticks = sample(0, 0.25);
+  equation
+    when ticks then
+      y = pre(u);
+    end when;
+  end Delay;
+
   block HoldTruth
     BooleanInput u;
     BooleanOutput y;
@@ -261,9 +272,12 @@ def test_clocks(library):
     one = library.component("Marks.Sample", clock=0.25)(ev, "one")
     two = library.component("Marks.SampleByClock", clock=0.25)(ev, "two")
     truths = [library.component(f"Marks.{n}Truth", clock=0.25)(ev, n) for n in ("Sample", "Hold")]
+    first, second = (library["Marks.Delay"](ev, n) for n in ("first", "second"))
     turn = Step(ev, "turn", start_time=0.4)
     loop, lag, step = library["Marks.Loop"](ev, "loop"), FirstOrder(ev, "lag", T=1.0), Constant(ev, "step", 1.0)
-    d.add(ticks, one, two, loop, lag, step, turn, *truths)
+    d.add(ticks, one, two, loop, lag, step, turn, first, second, *truths)
+    d.connect(lag.y, first.u)
+    d.connect(first.y, second.u)
     d.connect(turn.y, *(t.u for t in truths))
     d.connect(step.y, lag.u)
     d.connect(lag.y, one.u, two.u)
@@ -272,6 +286,9 @@ def test_clocks(library):
     assert s["ticks.y"].tolist() == [1, 2, 3, 4]
     for name in ("one.y", "two.y"):
         np.testing.assert_allclose(s[name], 1.0 - np.exp(-np.floor(np.asarray(ts) / 0.25) * 0.25), atol=1e-8)
+    before = 1.0 - np.exp(-np.floor(np.asarray(ts) / 0.25) * 0.25)
+    np.testing.assert_allclose(s["first.y"], before, atol=1e-8)
+    np.testing.assert_allclose(s["second.y"], [-1.0, *before[:-1]], atol=1e-8)
     assert s["Sample.y"].tolist() == s["Hold.y"].tolist() == [0, 0, 1, 1]
     assert s["loop.count"].tolist() == [6, 7, 8, 9]
     assert s["loop.late"].tolist() == [0, 0, 0, 1]
