@@ -329,6 +329,41 @@ end Clutch;
     assert with_readable_sources([root], copies) == [root]
 
 
+def test_errors_under_a_condition_become_assertions(tmp_path):
+    """Lines stay where they are. What does more than to end the run stays as it is."""
+    controller = """within Parts;
+model Controller
+  parameter Real start = 0, low = -1, high = 1;
+  parameter Boolean begins = false;
+equation
+  if
+      begins and (start < low or
+      start > high) then
+    Modelica.Utilities.Streams.error("start (=" + String(start) + "; \\"y\\") is "
+      + String(low));
+  end if;
+  if begins then
+    x = 1;
+  else
+    Streams.error("no");
+  end if;
+end Controller;
+"""
+    root = tmp_path / "lib"
+    (root / "Parts").mkdir(parents=True)
+    (root / "Parts" / "package.mo").write_text("package Parts\nend Parts;\n")
+    (root / "Parts" / "Controller.mo").write_text(controller)
+    (tmp_path / "copies").mkdir()
+    [copy] = with_readable_sources([root], tmp_path / "copies")
+    new = (copy / "Parts" / "Controller.mo").read_text()
+    assert new.count("\n") == controller.count("\n")
+    assert new.splitlines()[11:] == controller.splitlines()[11:]
+    assert " ".join(new[new.index("assert") : new.index("if begins then")].split()) == (
+        'assert(not (begins and (start < low or start > high)), "start (=" + String(start) + "; \\"y\\") is " '
+        "+ String(low));"
+    )
+
+
 def test_a_library_is_packed_from_the_command_line(tmp_path, library, capsys):
     file = tmp_path / "devices.zip"
     assert main(["pack", str(file), "Devices", "--root", str(written_to(tmp_path))]) == 0
