@@ -23,7 +23,7 @@ from .complex_sources import with_real_equations
 from .kept_files import contents, write
 from .sources import Sources
 
-_FORMAT = 4  # to be raised with every change of what is changed in sources
+_FORMAT = 5  # to be raised with every change of what is changed in sources
 _LOOK_UP = "getTable1DValue"
 # parameter Type name(modifiers) = binding "comment";
 _BOUND = re.compile(

@@ -481,6 +481,50 @@ end Bank;
     assert new == expected
 
 
+def test_inputs_of_components_are_equal_to_those_of_their_class(tmp_path):
+    """A flip-flop, which opens; what may be absent stays a connection."""
+    source = """package Logic
+  connector In = input Boolean;
+  connector Out = output Boolean;
+  block Nor
+    In a, b;
+    Out y;
+  equation
+    y = not (a or b);
+  end Nor;
+  block Pre
+    In u;
+    Out y;
+  equation
+    y = pre(u);
+  end Pre;
+  block Keeps
+    parameter Boolean more = false;
+    In s, r;
+    In t if more;
+    Out q;
+    Nor first, second;
+    Nor third if more;
+    Pre late;
+  equation
+    connect(s, first.a);
+    connect(second.b, r);
+    connect(t, third.a);
+    connect(r, third.b);
+    connect(second.y, first.b);
+    connect(first.y, late.u);
+    connect(late.y, second.a);
+    connect(second.y, q);
+  end Keeps;
+end Logic;
+"""
+    (tmp_path / "Logic.mo").write_text(source)
+    new = with_single_connections(Sources([tmp_path]), source)
+    expected = source.replace("connect(s, first.a)", "first.a = s").replace("connect(second.b, r)", "second.b = r")
+    assert new == expected
+    assert Library(tmp_path)["Logic.Keeps"].opened.inputs == ("s", "r")
+
+
 def test_a_size_without_a_value_is_asked_for():
     text = "model Bank parameter Integer n; Real x[n]; equation x = fill(time, n); end Bank;"
     with pytest.raises(ModelError, match=r"gives no value to 'n', which decides its equations: component\(…, n=…\)"):
