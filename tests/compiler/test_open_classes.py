@@ -287,7 +287,7 @@ def test_classes_are_data(library, tmp_path):
         packed.component("Devices.Load", m=2)
     with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
         archive.writestr("A.json", json.dumps({"format": 0}))
-    with pytest.raises(ModelError, match=r"this is no class of format 4: it has format 0"):
+    with pytest.raises(ModelError, match=r"this is no class of format 5: it has format 0"):
         Library(tmp_path / "c.zip")["A"]
     (tmp_path / "d.zip").write_bytes(b"none")
     with pytest.raises(ModelError, match=r"'.*d.zip' is not a file of packed classes"):

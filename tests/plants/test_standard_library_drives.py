@@ -45,7 +45,7 @@ def test_motors_of_a_watt_and_of_a_megawatt(library):
     reference = {"TaNominal": 293.15, "TaRef": 293.15}
     small = Small(
         ev, "small", VaNominal=12.0, IaNominal=0.5, wNominal=300.0, Ra=3.0, La=2e-3, Jr=1e-5, alpha20a=3.93e-3,
-        start={"la.i": 0.0}, **reference,
+        TaOperational=293.15, start={"la.i": 0.0}, **reference,
     )  # fmt: skip
     large = opened(library, f"{MACHINES}.DCMachines.DC_PermanentMagnet")(
         ev, "large", VaNominal=1000.0, IaNominal=1000.0, wNominal=150.0, Ra=0.02, La=5e-4, Jr=40.0, alpha20a=0.0,
