@@ -4,8 +4,9 @@ A front end that flattens a class alone takes it for a complete model: what ente
 a body believes that it is the root of all frames. So the class becomes a component of a model. Each of its connectors
 with streams is connected to a boundary, whose stream variables are what `inStream` reads. In a class with semiLinear
 each connector with flows is: the front end takes flows of loose connectors for zero, and puts h = h1 in the place of
-H_flow = semiLinear(m_flow, h, h1). A boundary that is a root is joined to each tree of frames; in place of the
-equations that a connection to it would bring, as many others stand.
+H_flow = semiLinear(m_flow, h, h1). So is each one whose `cardinality` an equation reads, which is zero for loose ones.
+A boundary that is a root is joined to each tree of frames; in place of the equations that a connection to it would
+bring, as many others stand.
 Afterwards, everything that reads variables of boundaries goes out, and so does an `inner` component that the front end
 has added by itself, as `world`, if no equation of the class reads its variables.
 """
@@ -74,10 +75,11 @@ def flattened(
     changes: str = "",
     source: str | None = None,
     records: Callable[[], Mapping[str, bool]] = dict,
+    counted: frozenset[str] = frozenset(),
 ) -> Closed:
     """Flattens a class, alone or, if its connectors ask for it, with boundaries. `records` names the overdetermined
     records of its connectors, and says whether the connector is conditional: nothing else tells of those that no
-    equation relates to others.
+    equation relates to others. `counted` are those of its connectors whose connections its equations count.
 
     **Raises:**
 
@@ -87,6 +89,9 @@ def flattened(
     modified = f"{_INSIDE}({changes})" if changes else _INSIDE
     alone, trees = _alone(front_end, name, changes, source, records)
     bounded = list(_connectors(alone.flat, "flow" if _with_semi_linear(alone.dae) else "stream"))
+    bounded += [
+        n for n in _connectors(alone.flat, "flow") if n in counted - {*bounded} and not _in_graph(alone.flat, n)
+    ]
     if not trees and not bounded:
         return Closed(alone, graph=_edges(alone.flat), roots=tuple(alone.flat["definite_roots"]))
     variables = alone.flat["variables"]
@@ -196,11 +201,17 @@ def _connectors(flat: Json, prefix: str) -> Iterator[str]:
     yield from (n for n in dict.fromkeys(found) if re.split(r"[.\[]", n)[0] in tops)
 
 
+def _in_graph(flat: Json, connector: str) -> bool:
+    """Whether a connector has an overdetermined record, which boundaries of another kind close."""
+    return any(v["is_overconstrained"] for n, v in flat["variables"].items() if n.startswith(f"{connector}."))
+
+
 def _rim(k: int, top: str, variables: Mapping[str, Json]) -> Iterator[str]:
     """A boundary for a connector: a connector with the same variables, and values of all but its flows."""
     declared, values = [], []
     for n, v in variables.items():
-        if not n.startswith(f"{top}.") or v["causality"] != "Empty":
+        # A connector may have parameters, such as a record of its medium.
+        if not n.startswith(f"{top}.") or v["causality"] != "Empty" or v["variability"] != "Empty":
             continue
         name, size = n[len(top) + 1 :], _size(n, variables)
         prefix = "flow " if v["flow"] else "stream " if v["stream"] else ""

@@ -525,6 +525,37 @@ end Logic;
     assert Library(tmp_path)["Logic.Keeps"].opened.inputs == ("s", "r")
 
 
+def test_open_connectors_count_as_connected(tmp_path):
+    """Alone, a line force found its flanges loose: no force acted."""
+    text = """package Lines
+  connector Flange
+    Real s;
+    flow Real f;
+  end Flange;
+  partial model Two
+    Flange a, b;
+  equation
+    assert(cardinality(b) > 0, "loose");
+  end Two;
+  model Line
+    extends Two;
+    Real force;
+  equation
+    a.s = 0;
+    b.s = 2;
+    if cardinality(a) > 0 then
+      force = a.f;
+    else
+      force = 0;
+    end if;
+  end Line;
+end Lines;
+"""
+    (tmp_path / "Lines.mo").write_text(text)
+    line = Library(tmp_path)["Lines.Line"](EqnEnv(), "line")
+    assert "-a.f + force" in map(str, line.equations)
+
+
 def test_a_size_without_a_value_is_asked_for():
     text = "model Bank parameter Integer n; Real x[n]; equation x = fill(time, n); end Bank;"
     with pytest.raises(ModelError, match=r"gives no value to 'n', which decides its equations: component\(…, n=…\)"):

@@ -73,7 +73,8 @@ def test_a_capacitor_is_charged_through_a_switch_and_a_heated_resistor(library):
 def test_what_flows_through_a_connector_is_not_zero_in_semi_linear():
     """The front end takes flows of loose connectors for zero: H = semiLinear(m, h, inside) was read as h = inside."""
     text = """
-connector Port Real p; flow Real m; Real h; flow Real H; end Port;
+record Medium parameter Real cp = 1; end Medium;
+connector Port parameter Medium medium; Real p; flow Real m; Real h; flow Real H; end Port;
 model Source
   parameter Real p0, h0;
   Port port;

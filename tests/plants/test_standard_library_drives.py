@@ -259,3 +259,67 @@ def test_a_rectifier_of_the_library_on_our_capacitor(library):
     np.testing.assert_allclose(found["tank.v"], reference(*values.values())[0], rtol=1e-6)
     for name, expected in by_differences(reference, values, 1e-3).items():
         assert slopes[name] == pytest.approx(expected, rel=1e-3), name
+
+
+def test_three_phases_of_currents_and_of_phasors(library):
+    """A source of three phases on unequal resistors and coils, with our resistor in the neutral line. Currents from
+    zero, by SciPy; the same circuit of phasors, by the equations of nodes."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    V, R, L = [100.0, 100.0, 100.0], [10.0, 20.0, 5.0], [0.02, 0.05, 0.04]
+
+    def part(path, name, structure=None, **values):
+        x = library.component(f"Modelica.Electrical.{path}", **(structure or {}))(ev, name, **values)
+        d.add(x)
+        return x
+
+    three = {"m": 3}
+    source = part("Polyphase.Sources.SineVoltage", "source", three, V=V, f=[50.0] * 3)
+    r = part("Polyphase.Basic.Resistor", "r", three, R=R)
+    coil = part("Polyphase.Basic.Inductor", "coil", three, L=L, start={f"inductor[{k}].i": 0.0 for k in (1, 2, 3)})
+    ends = [part("Polyphase.Basic.Star", n, three) for n in ("one", "other")]
+    neutral, g = electrical.Resistor(ev, "neutral", R=2.0), electrical.Ground(ev, "g")
+    d.add(neutral, g)
+    for k in range(3):
+        d.connect(source.plug_p[k], r.plug_p[k])
+        d.connect(r.plug_n[k], coil.plug_p[k])
+        d.connect(coil.plug_n[k], ends[1].plug_p[k])
+        d.connect(source.plug_n[k], ends[0].plug_p[k])
+    d.connect(ends[1].pin_n, neutral.p)
+    d.connect(ends[0].pin_n, neutral.n, g.p)
+
+    phasors = "QuasiStatic.Polyphase"
+    source_q = part(f"{phasors}.Sources.VoltageSource", "source_q", three, V=V, f=50.0)
+    r_q = part(f"{phasors}.Basic.Resistor", "r_q", three, R_ref=R)
+    coil_q = part(f"{phasors}.Basic.Inductor", "coil_q", three, L=L)
+    ends_q = [part(f"{phasors}.Basic.Star", n, three) for n in ("one_q", "other_q")]
+    neutral_q = part("QuasiStatic.SinglePhase.Basic.Resistor", "neutral_q", R_ref=2.0)
+    g_q = part("QuasiStatic.SinglePhase.Basic.Ground", "g_q")
+    d.connect(source_q.plug_p, r_q.plug_p)
+    d.connect(r_q.plug_n, coil_q.plug_p)
+    d.connect(coil_q.plug_n, ends_q[1].plug_p)
+    d.connect(source_q.plug_n, ends_q[0].plug_p)
+    d.connect(ends_q[1].pin_n, neutral_q.pin_p)
+    d.connect(ends_q[0].pin_n, neutral_q.pin_n, g_q.pin)
+    system = AcausalCompiler(ev, d)()
+    values = {"source.V[2]": 100.0, "r.R[3]": 5.0, "coil.L[1]": 0.02, "neutral.R": 2.0}
+    values |= {"source_q.V[2]": 100.0, "r_q.R_ref[3]": 5.0, "coil_q.L[1]": 0.02, "neutral_q.R_ref": 2.0}
+    ts = np.array([0.003, 0.01, 0.025])
+    names = [f"coil.inductor[{k}].i" for k in (1, 2, 3)] + ["neutral_q.i.re", "neutral_q.i.im"]
+    found, slopes = run_with_slopes(system, values, ts, names, names)
+    turns = np.exp(-2j * np.pi * np.arange(3) / 3)
+
+    def reference(V2, R3, L1, Rn, V2q, R3q, L1q, Rnq):
+        volts, ohms, henries = np.array([100.0, V2, 100.0]), np.array([10.0, 20.0, R3]), np.array([L1, 0.05, 0.04])
+
+        def slope(t, i):
+            u = volts * np.sin(100 * np.pi * t - 2 * np.pi * np.arange(3) / 3)
+            return (u - ohms * i - Rn * i.sum()) / henries
+
+        i = solved(slope, np.zeros(3), ts)
+        y = 1 / (np.array([10.0, 20.0, R3q]) + 100j * np.pi * np.array([L1q, 0.05, 0.04]))
+        current = (y * np.array([100.0, V2q, 100.0]) * turns).sum() / (1 + Rnq * y.sum())
+        return np.array([*i, np.full(3, current.real), np.full(3, current.imag)])
+
+    np.testing.assert_allclose([found[n] for n in names], reference(*values.values()), rtol=1e-6, atol=1e-6)
+    for name, expected in by_differences(reference, values).items():
+        assert slopes[name] == pytest.approx(expected, rel=1e-5), name
