@@ -15,6 +15,7 @@ from jaxonomy_dae.compile.model.tables import Declared
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.host import kept
 from jaxonomy_dae.library import electrical, thermal
+from jaxonomy_dae.library.signal import Constant, Gain
 from jaxonomy_dae.modelica import Library, component
 from jaxonomy_dae.modelica.__main__ import main
 from jaxonomy_dae.modelica.boolean_connections import with_single_connections
@@ -554,6 +555,26 @@ end Lines;
     (tmp_path / "Lines.mo").write_text(text)
     line = Library(tmp_path)["Lines.Line"](EqnEnv(), "line")
     assert "-a.f + force" in map(str, line.equations)
+
+
+def test_outputs_that_are_held_between_events_drive_inputs():
+    """They were no variables, and nothing could be connected to them."""
+    text = """connector RealInput = input Real;
+connector BooleanOutput = output Boolean;
+block Relay
+  RealInput u;
+  BooleanOutput y;
+equation
+  y = not pre(y) and u > 1 or pre(y) and u >= 0;
+end Relay;
+"""
+    ev, d = EqnEnv(), AcausalDiagram()
+    relay, level, gain = component("Relay", source=text)(ev, "relay"), Constant(ev, "level", 2.0), Gain(ev, "gain", 3.0)
+    d.add(relay, level, gain)
+    d.connect(level.y, relay.u)
+    d.connect(relay, "y", gain, "u")
+    system = AcausalCompiler(ev, d)()
+    assert system.plan.resolve(["gain.u"])[0] == system.plan.resolve(["relay.y"])[0]
 
 
 def test_a_size_without_a_value_is_asked_for():
