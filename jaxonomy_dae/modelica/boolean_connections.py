@@ -33,8 +33,12 @@ def _written_out(sources: Sources, of: Found, mark: Mark) -> Iterator[Change]:
     ranks = [_rank(sources, of, e, frozenset(mark.local)) for e in sides]
     if len(sides) < 2 or len(set(ranks)) > 1 or ranks[0] not in (0, 1):
         return
+    declared = {d.name: d for d, _ in sources.declarations(of)}
+    # A connection to what is not there is none, while an equation would lack a name.
+    loose = any("conditional" in declared[e.parts[0]].prefixes for e in sides)
     if not ranks[0]:
-        yield mark.begin, mark.end, _given(sources, of, sides, sides)
+        if not loose:
+            yield mark.begin, mark.end, _given(sources, of, sides, sides)
         return
     places = [where_array(sources, of, e) for e in sides]
     pairs = [(e, at) for e, at in zip(sides, places, strict=True) if at is not None]
@@ -43,30 +47,30 @@ def _written_out(sources: Sources, of: Found, mark: Mark) -> Iterator[Change]:
     entries = [with_entry(e, at, tree.Reference((_PLACE,))) for e, at in pairs]
     sizes = [_declared_size(sources, of, *pair) for pair in pairs]
     size = next((s for s in sizes if s is not None), size_of(*pairs[0]))
-    loop = f"for {_PLACE} in 1:{text_of(size)} loop {_given(sources, of, sides, entries)}; end for"
+    connection = f"connect({', '.join(map(text_of, entries))})" if loose else _given(sources, of, sides, entries)
+    loop = f"for {_PLACE} in 1:{text_of(size)} loop {connection}; end for"
     yield mark.begin, mark.end, loop
 
 
 def _rank(sources: Sources, of: Found, e: tree.Reference, local: frozenset[str]) -> int | None:
-    """How many dimensions a discrete connector has that is always there; None for all others."""
-    declared = {d.name: d for d, _ in sources.declarations(of)}
-    if e.parts[0] not in declared or "conditional" in declared[e.parts[0]].prefixes:
-        return None  # a connection to what is not there is none, while an equation would lack a name
+    """How many dimensions a discrete connector has; None for what is none."""
     kind, rank, followed = type_of(sources, of, e, local)
-    return rank if followed == len(e.parts) and len(_causality(sources, kind)) == 1 else None
+    known = any(d.name == e.parts[0] for d, _ in sources.declarations(of))
+    discrete, causality = _discrete(sources, kind)
+    return rank if known and discrete and followed == len(e.parts) and (rank or causality) else None
 
 
-def _causality(sources: Sources, kind: Found | None) -> set[str]:
-    """Whether a connector of Booleans or of an enumeration is an input or an output; empty for all others."""
+def _discrete(sources: Sources, kind: Found | None) -> tuple[bool, set[str]]:
+    """(True for a connector of Booleans or of an enumeration; whether it is an input or an output)."""
     prefixes: set[str] = set()
     name = ""
     while kind is not None and kind.source.alias is not None:
         prefixes |= kind.prefixes | kind.source.alias.prefixes
         name = kind.source.alias.type
         kind = sources.class_of(name, kind.scopes)
-    discrete = name == "Boolean" or kind is not None and bool(kind.source.literals)
     prefixes |= kind.prefixes if kind is not None else set()
-    return prefixes & {"input", "output"} if discrete else set()
+    discrete = name == "Boolean" or kind is not None and bool(kind.source.literals)
+    return discrete, prefixes & {"input", "output"}
 
 
 def _given(sources: Sources, of: Found, sides: list[tree.Reference], written: list[tree.Reference]) -> str:
@@ -84,7 +88,7 @@ def _receives(sources: Sources, of: Found, e: tree.Reference) -> bool:
     first, _, _ = type_of(sources, of, tree.Reference(e.parts[:1], e.subscripts[:1]))
     inside = len(e.parts) > 1 and (first is None or first.source.kind != "connector")
     kind, _, _ = type_of(sources, of, e)
-    return ("input" in _causality(sources, kind)) == inside
+    return ("input" in _discrete(sources, kind)[1]) == inside
 
 
 def _declared_size(sources: Sources, of: Found, e: tree.Reference, at: int) -> tree.Expression | None:

@@ -2,8 +2,11 @@
 
 A front end that flattens a class alone takes it for a complete model: what enters by a stream is then what leaves, and
 a body believes that it is the root of all frames. So the class becomes a component of a model. Each of its connectors
-with streams is connected to a boundary, whose stream variables are what `inStream` reads. A boundary that is a root is
-joined to each tree of frames; in place of the equations that a connection to it would bring, as many others stand.
+with streams is connected to a boundary, whose stream variables are what `inStream` reads. In a class with semiLinear
+each connector with flows is: the front end takes flows of loose connectors for zero, and puts h = h1 in the place of
+H_flow = semiLinear(m_flow, h, h1). So is each one whose `cardinality` an equation reads, which is zero for loose ones.
+A boundary that is a root is joined to each tree of frames; in place of the equations that a connection to it would
+bring, as many others stand.
 Afterwards, everything that reads variables of boundaries goes out, and so does an `inner` component that the front end
 has added by itself, as `world`, if no equation of the class reads its variables.
 """
@@ -55,11 +58,12 @@ _KINDS = (
 
 
 class Closed(NamedTuple):
-    """A class that was flattened as a component of a model: `outer` are the variables of components that the front end
-    has added, `graph` are edges of the trees of overdetermined records and `roots` those of its records that begin a
-    tree."""
+    """A class that was flattened as a component of a model: `bounded` are the connectors that met a boundary, `outer`
+    the variables of components that the front end has added, `graph` edges of the trees of overdetermined records, and
+    `roots` those of its records that begin a tree."""
 
     found: Flattened
+    bounded: frozenset[str] = frozenset()
     outer: frozenset[str] = frozenset()
     graph: tuple[tuple[str, str], ...] = ()
     roots: tuple[str, ...] = ()
@@ -71,10 +75,11 @@ def flattened(
     changes: str = "",
     source: str | None = None,
     records: Callable[[], Mapping[str, bool]] = dict,
+    counted: frozenset[str] = frozenset(),
 ) -> Closed:
     """Flattens a class, alone or, if its connectors ask for it, with boundaries. `records` names the overdetermined
     records of its connectors, and says whether the connector is conditional: nothing else tells of those that no
-    equation relates to others.
+    equation relates to others. `counted` are those of its connectors whose connections its equations count.
 
     **Raises:**
 
@@ -83,15 +88,18 @@ def flattened(
     before = f"{source or ''}\n"
     modified = f"{INSIDE}({changes})" if changes else INSIDE
     alone, trees = _alone(front_end, name, changes, source, records)
-    streams = list(_with_streams(alone.flat))
-    if not trees and not streams:
+    bounded = list(_connectors(alone.flat, "flow" if _with_semi_linear(alone.dae) else "stream"))
+    bounded += [
+        n for n in _connectors(alone.flat, "flow") if n in counted - {*bounded} and not _in_graph(alone.flat, n)
+    ]
+    if not trees and not bounded:
         return Closed(alone, graph=_edges(alone.flat), roots=tuple(alone.flat["definite_roots"]))
     variables = alone.flat["variables"]
     declared, equations, renamed = [f"{name} {modified};"], [], {}
     if "world.enableAnimation" in variables:
         # Without animation, whose shapes are variables that nothing reads.
         declared.append("inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false);")
-    for k, top in enumerate(streams):
+    for k, top in enumerate(bounded):
         declared += _rim(k, top, variables)
         equations.append(f"connect({INSIDE}.{top}, {RIM}{k}.port);")
         for n, v in variables.items():
@@ -103,7 +111,7 @@ def flattened(
         equations.append(f"{INSIDE}.{n} = {RIM}u{k};")
     roots = _roots(trees, f"{INSIDE}.")
     text = f"{before}{_model([*declared, *roots[0]], [*roots[1], *equations])}"
-    return _as_alone(front_end.flatten(text, MODEL, called=name), alone, renamed)
+    return _as_alone(front_end.flatten(text, MODEL, called=name), alone, renamed)._replace(bounded=frozenset(bounded))
 
 
 def _alone(
@@ -179,18 +187,31 @@ def _roots(trees: Sequence[str], inside: str) -> tuple[list[str], list[str]]:
     return declared, equations
 
 
-def _with_streams(flat: Json) -> Iterator[str]:
-    """The innermost connectors of the class that have streams."""
+def _with_semi_linear(dae: Json) -> bool:
+    """Whether the front end has put something else in the place of a semiLinear."""
+    return any(
+        p["origin"] == {"generated": "semi_linear_lowering"} for p in dae["storage"]["expressions"]["provenance"]
+    )
+
+
+def _connectors(flat: Json, prefix: str) -> Iterator[str]:
+    """The innermost connectors of the class that have variables with this prefix, flow or stream."""
     tops = {n.partition("[")[0] for n in flat["top_level_connectors"]}
-    found = [n.rpartition(".")[0] for n, v in flat["variables"].items() if v["stream"]]
+    found = [n.rpartition(".")[0] for n, v in flat["variables"].items() if v[prefix]]
     yield from (n for n in dict.fromkeys(found) if re.split(r"[.\[]", n)[0] in tops)
+
+
+def _in_graph(flat: Json, connector: str) -> bool:
+    """Whether a connector has an overdetermined record, which boundaries of another kind close."""
+    return any(v["is_overconstrained"] for n, v in flat["variables"].items() if n.startswith(f"{connector}."))
 
 
 def _rim(k: int, top: str, variables: Mapping[str, Json]) -> Iterator[str]:
     """A boundary for a connector: a connector with the same variables, and values of all but its flows."""
     declared, values = [], []
     for n, v in variables.items():
-        if not n.startswith(f"{top}.") or v["causality"] != "Empty":
+        # A connector may have parameters, such as a record of its medium.
+        if not n.startswith(f"{top}.") or v["causality"] != "Empty" or v["variability"] != "Empty":
             continue
         name, size = n[len(top) + 1 :], _size(n, variables)
         prefix = "flow " if v["flow"] else "stream " if v["stream"] else ""
@@ -244,7 +265,9 @@ def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) ->
             v["role"] = "input"
         if n in inputs or n in before and before[n]["role"] != "input":
             v["attributes"]["causality"] = before[n]["attributes"]["causality"]
-    return Closed(Flattened(found.name, dae, flat), outer, _edges(flat), tuple(flat["definite_roots"]))
+    return Closed(
+        Flattened(found.name, dae, flat), outer=outer, graph=_edges(flat), roots=tuple(flat["definite_roots"])
+    )
 
 
 def _edges(flat: Json) -> tuple[tuple[str, str], ...]:

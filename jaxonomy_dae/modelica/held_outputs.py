@@ -10,7 +10,7 @@ from . import tree
 from .definitions import assigned_in, read_before, whens_in
 from .flat_model import FlatModel
 
-HELD = "__held"  # ends the name of the variable that keeps an output
+HELD = ":held"  # ends the name of the variable that keeps an output
 
 
 def with_held_outputs(flat: FlatModel, outputs: Collection[str]) -> FlatModel:

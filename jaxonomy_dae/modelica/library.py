@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import ModelError, nearest
+from . import tree
 from .balance import balance
 from .boundaries import flattened
 from .clocked_boundaries import Signal, signals_of, with_clock
@@ -109,11 +110,9 @@ class Library:
             return opened(name, closed, self._names)
         # Records are read from the sources only if the front end misses equations: it takes a search through files.
         try:
-            return opened(
-                name,
-                flattened(self.front_end, name, changes, source, functools.partial(self._records, name, source)),
-                self._names,
-            )
+            records, counted = functools.partial(self._records, name, source), self._counted(name, source)
+            closed = flattened(self.front_end, name, changes, source, records, counted)
+            return opened(name, closed, self._names)
         except Unclocked:
             raise ModelError(
                 f"'{name}': its surroundings decide when its clock ticks. component(…, clock=0.1) opens it with a "
@@ -150,6 +149,19 @@ class Library:
             and of.source.kind == "connector"
             for record in self._overdetermined(of)
         }
+
+    def _counted(self, name: str, source: str | None) -> frozenset[str]:
+        """The connectors of a class whose connections its equations count; assertions do not matter."""
+        found = self._names.find(name) if source is None else None
+        if not isinstance(found, Found):
+            return frozenset()
+        equations = [e for part in self._names.lineage(found) for e in part.source.equations]
+        return frozenset(
+            call.arguments[0].path
+            for call in tree.each_part(tuple(e for e in equations if not isinstance(e, tree.Effect)))
+            if isinstance(call, tree.Call) and call.function == "cardinality"
+            if isinstance(call.arguments[0], tree.Reference)
+        )
 
     def _overdetermined(self, connector: Found) -> Iterator[str]:
         """The records of a connector whose type has a function `equalityConstraint`: they are overdetermined."""

@@ -83,8 +83,9 @@ def opened(name: str, closed: Closed, sources: Sources) -> OpenClass:
     if found.flat.get("is_partial"):
         raise ModelError(f"'{name}' is partial: open a class that extends it, or write one as source=…")
     ports = tuple(p for top in found.flat["top_level_connectors"] for p in _ports(name, top, found.flat["variables"]))
-    # A connector with streams was connected to a boundary, and has no equation that closes it.
-    flows = [f"{port.name}.{flow}" for port in ports for flow, _ in port.flows if not port.streams]
+    # A connector that was connected to a boundary has no equation that closes it.
+    loose = [p for p in ports if not {p.name, re.sub(r"\[[\d,]+\]$", "", p.name)} & closed.bounded]
+    flows = [f"{port.name}.{flow}" for port in loose for flow, _ in port.flows]
     flat = with_external_objects(read_open(found.dae, name.rpartition(".")[2], flows), found.flat)
     flat = with_starts_of_inputs(with_algorithms(without_boundaries(flat, closed.outer), sources))
     storage = found.dae["storage"]
