@@ -91,7 +91,7 @@ class RumocaExpressions:
         if kind == "discrete":
             return self.expression(inside, {})
         if kind == "clock":
-            return self._clock(inside)
+            return self.clock(inside)
         if kind == "not":
             return tree.Unary("not", self.condition(inside))
         if kind in ("and", "or"):
@@ -101,13 +101,18 @@ class RumocaExpressions:
             return tree.Array(tuple(p for e in parts for p in (e.entries if isinstance(e, tree.Array) else (e,))))
         self.refuse(f"a condition of the kind '{kind}'", entry.get("provenance"))
 
-    def _clock(self, number: int) -> tree.Expression:
+    def clock(self, number: int) -> tree.Call:
+        """The condition that a clock ticks."""
         clock = self.storage["clocks"][number]
         lattice = clock["kind"].get("periodic", {}).get("lattice")
         if lattice is None:
             self.refuse(f"a clock of the kind '{next(iter(clock['kind']))}'", clock.get("provenance"))
         phase, period = (tree.Number(lattice[k]["num"] / lattice[k]["den"]) for k in ("phase", "period"))
         return tree.Call("sample", (phase, period), ())
+
+    def interval(self, number: int) -> tree.Expression:
+        """The seconds between two ticks of a clock."""
+        return self.clock(number).arguments[1]
 
     # --- expressions -------------------------------------------------------------------------------------------------
 
@@ -154,6 +159,8 @@ class RumocaExpressions:
             return tree.Range(first, tree.Number(1) if step is None else self.expression(step, places), last)
         if kind == "array_update":
             return self._updated(number)
+        if kind == "clock_transfer":
+            return self._transferred(inside, where, places)
         if kind == "runtime_quotient_owner":
             sides = (self.expression(inside["lhs"], places), self.expression(inside["rhs"], places))
             return tree.Call(inside["builtin"], sides, ())
@@ -173,6 +180,15 @@ class RumocaExpressions:
         builtin: str = inside["builtin"]
         return tree.Call(_BUILTIN.get(builtin, builtin), arguments, ())
 
+    def _transferred(self, inside: Json, where: Json, places: Places) -> tree.Expression:
+        """A value at the ticks of another clock: the last one that it had at its own."""
+        kind, count = next(iter(inside["kind"].items()))
+        if kind == "shift_sample" and not count["counter"] < count["resolution"]:
+            self.refuse("a shift by a whole interval of a clock or more", where)
+        if kind not in ("sub_sample", "super_sample", "shift_sample"):
+            self.refuse(f"the conversion '{kind}' of a clock", where)
+        return self.expression(inside["source"], places)
+
     def _arguments(self, inside: Json, first: int, places: Places) -> tuple[tree.Expression, ...]:
         return tuple(self.expression(k, places) for k in self.operands[first : first + inside["operand_count"]])
 
@@ -190,6 +206,11 @@ class RumocaExpressions:
             return tree.Call("der", (self.variable(inside, subscripts),), ())
         if kind.startswith("pre_") and kind[4:] in VARIABLE:
             return tree.Call("pre", (self.variable(inside, subscripts),), ())
+        if kind == "previous":
+            of = self.storage["previous_values"][inside]["variable"]
+            return tree.Call("pre", (self.variable(of, subscripts),), ())
+        if kind == "clock_interval":
+            return self.interval(inside)
         if kind == "condition":
             return self.condition(inside)
         if kind == "terminal":

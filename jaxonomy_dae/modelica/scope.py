@@ -18,12 +18,14 @@ from ..graph.expressions.from_sympy import symbols_of
 from ..write.choices import exchanged
 from ..write.component import Component
 from ..write.discrete_equations import BEFORE, STARTED, DiscreteEquations
-from ..write.events import terminate
+from ..write.events import Sampled, terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
+from .clocked import SAMPLED
 from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter
-from .left_out import LEFT_OUT
+from .kept_inputs import KEPT
+from .left_out import LEFT_OUT, TIME_TABLE, time_table_coefficients
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
@@ -50,6 +52,7 @@ class Scope:
     - `carried_out`: what algorithms assign, by their numbers.
     - `said`: the discrete variables of which initial equations say what they are. `waiting`: initial equations of
       discrete variables that wait for others, which they do while `postpones` is true.
+    - `clock`: the clock of the body of a `when` that is being read, if nothing else lets it act.
     - `as_numbers`: True while parameters are read as their values, which are final then.
     """
 
@@ -65,9 +68,10 @@ class Scope:
         self.being: list[str] = []
         special: dict[str, Callable[..., Value]] = {
             "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self._is_initial,
-            "terminal": lambda: False, "sample": self._sample, "delay": _delay,
+            "terminal": lambda: False, "sample": self._sample, SAMPLED: self._sampled, "delay": _delay,
         }  # fmt: skip
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
+        special[TIME_TABLE] = self._time_table
         special |= {name: functools.partial(_clocked, name) for name in _CLOCKED if name not in flat.classes}
         self.random = RandomNumbers(component)
         self.interpreter = Interpreter(
@@ -79,6 +83,7 @@ class Scope:
         self.discrete = DiscreteEquations(component, self.interpreter.quieted)
         self.kept = self.discrete.kept
         self.as_numbers = False
+        self.clock: Sampled | None = None
         self.final: dict[str, Value] = {}
         # Only now: sizes may depend on parameters, records and functions, which the interpreter finds by their names.
         self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
@@ -393,6 +398,15 @@ class Scope:
         finally:
             self.as_numbers = False
 
+    def _time_table(self, table: Expression, *others: Expression) -> Value:
+        """The line of a time table at an event; the entries of the table, which say when events are, are numbers."""
+        self.as_numbers = True
+        try:
+            entries = self.evaluate(table)
+        finally:
+            self.as_numbers = False
+        return time_table_coefficients(entries, *map(self.evaluate, others))
+
     def _read_table(self, read: Callable[..., Value], table: Table, column: int, u: Value, *more: Value) -> Value:
         """The value of a table. One without extrapolation ends the run where it is read outside of its rows."""
         outside = table.outside(u) if isinstance(u, sympy.Expr) else False
@@ -408,12 +422,15 @@ class Scope:
 
     def _pre(self, e: Expression) -> Value:
         value = self.evaluate(e)
+        if self.clock is not None and _variables(value):
+            return self._before_ticks(self.clock, value)
         for s in _variables(value):
             # A state jumps by `reinit` alone, at the end of an iteration: until then it is what it was before.
             if not s.path.startswith(":") and s.path not in self.states:
+                name = s.path.replace(KEPT, "")
                 raise ModelError(
-                    f"pre({s.path}): '{s.path}' is neither discrete nor a state, and may jump with others at the "
-                    f"instant: what it was before is not kept. Write pre(…) of what its equation reads"
+                    f"pre({name}): '{name}' is neither discrete nor a state, and may jump with others at the instant: "
+                    "what it was before is not kept. Write pre(…) of what its equation reads"
                 )
         return previous(value)
 
@@ -437,6 +454,18 @@ class Scope:
 
     def _sample(self, start: Expression, interval: Expression) -> Value:
         return self.discrete.tick(self.component.sampled(self.evaluate(interval), self.evaluate(start)))
+
+    def _sampled(self, e: Expression, start: Expression, interval: Expression) -> Value:
+        """A value before the ticks of a clock."""
+        clock = self.component.sampled(self.evaluate(interval), self.evaluate(start))
+        value = self.evaluate(e)
+        return self._before_ticks(clock, value)
+
+    def _before_ticks(self, clock: Sampled, value: Value) -> Value:
+        if isinstance(value, list):
+            return [self._before_ticks(clock, v) for v in value]
+        found = self.discrete.at_ticks(clock, sympy.sympify(as_number(value)))
+        return sympy.Eq(found, 1) if is_condition(value) else found
 
 
 def _is_of_parameters(value: sympy.Expr) -> bool:

@@ -24,14 +24,18 @@ def read_followed(scope: Scope, name: str) -> None:
 
 def read_when(scope: Scope, s: tree.Branches) -> None:
     """A `when` among equations: what its body assigns is what it was before where no branch acts."""
-    acting = scope.discrete.branches([list(_conditions(scope, c, scope.value)) for c, _ in s.branches])
+    conditions = [list(_conditions(scope, c, scope.value)) for c, _ in s.branches]
+    acting = scope.discrete.branches(conditions)
     cases: dict[str, list[tuple[Value, Value]]] = {}
-    for acts, (_, body) in zip(acting, s.branches, strict=True):
+    for acts, when, (_, body) in zip(acting, conditions, s.branches, strict=True):
+        # What a variable was before a tick is known, as nothing has happened at the instant.
+        scope.clock = scope.discrete.clock_of([truth for truth, _ in when])
         for target, value in _each_action(scope, body):
             if isinstance(target, DiscreteSymbol):
                 cases.setdefault(target.path, []).append((acts, value))
             else:
                 _act(scope, acts, target, value)
+        scope.clock = None
     for name, given in cases.items():
         scope.discrete.give(name, _first(given, previous(DiscreteSymbol(name))))
 

@@ -1,6 +1,7 @@
 """Modelica classes become classes of components with open ports. NumPy only."""
 
 import csv
+import functools
 import json
 import re
 import zipfile
@@ -15,6 +16,7 @@ from jaxonomy_dae.compile.model.tables import Declared
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.host import kept
 from jaxonomy_dae.library import electrical, thermal
+from jaxonomy_dae.library.signal import Constant, Gain
 from jaxonomy_dae.modelica import Library, component
 from jaxonomy_dae.modelica.__main__ import main
 from jaxonomy_dae.modelica.boolean_connections import with_single_connections
@@ -287,7 +289,7 @@ def test_classes_are_data(library, tmp_path):
         packed.component("Devices.Load", m=2)
     with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
         archive.writestr("A.json", json.dumps({"format": 0}))
-    with pytest.raises(ModelError, match=r"this is no class of format 4: it has format 0"):
+    with pytest.raises(ModelError, match=r"this is no class of format 6: it has format 0"):
         Library(tmp_path / "c.zip")["A"]
     (tmp_path / "d.zip").write_bytes(b"none")
     with pytest.raises(ModelError, match=r"'.*d.zip' is not a file of packed classes"):
@@ -327,6 +329,41 @@ end Clutch;
     assert (copy / "Parts" / "Other" / "package.mo").read_text().startswith("within Parts;")
     (root / "Parts" / "Clutch.mo").write_text(clutch.replace("getTable1D", "getTable2D"))
     assert with_readable_sources([root], copies) == [root]
+
+
+def test_errors_under_a_condition_become_assertions(tmp_path):
+    """Lines stay where they are. What does more than to end the run stays as it is."""
+    controller = """within Parts;
+model Controller
+  parameter Real start = 0, low = -1, high = 1;
+  parameter Boolean begins = false;
+equation
+  if
+      begins and (start < low or
+      start > high) then
+    Modelica.Utilities.Streams.error("start (=" + String(start) + "; \\"y\\") is "
+      + String(low));
+  end if;
+  if begins then
+    x = 1;
+  else
+    Streams.error("no");
+  end if;
+end Controller;
+"""
+    root = tmp_path / "lib"
+    (root / "Parts").mkdir(parents=True)
+    (root / "Parts" / "package.mo").write_text("package Parts\nend Parts;\n")
+    (root / "Parts" / "Controller.mo").write_text(controller)
+    (tmp_path / "copies").mkdir()
+    [copy] = with_readable_sources([root], tmp_path / "copies")
+    new = (copy / "Parts" / "Controller.mo").read_text()
+    assert new.count("\n") == controller.count("\n")
+    assert new.splitlines()[11:] == controller.splitlines()[11:]
+    assert " ".join(new[new.index("assert") : new.index("if begins then")].split()) == (
+        'assert(not (begins and (start < low or start > high)), "start (=" + String(start) + "; \\"y\\") is " '
+        "+ String(low));"
+    )
 
 
 def test_a_library_is_packed_from_the_command_line(tmp_path, library, capsys):
@@ -417,12 +454,19 @@ def test_equations_of_complex_numbers_are_two_of_real_ones(text, tmp_path):
         assert eval(python, names) == pytest.approx(value, rel=1e-13), name
 
 
-def test_connections_of_arrays_of_boolean_connectors_are_loops(tmp_path):
+def test_connections_of_discrete_connectors_are_equations(tmp_path):
     source = """package Bank
+  type Level = enumeration(low, high);
   connector Signal = input Boolean;
+  connector LevelIn = input Level;
+  connector LevelOut = output Level;
   model Switch
     Signal on;
   end Switch;
+  model Gate
+    LevelIn x;
+    LevelOut y;
+  end Gate;
   model Group
     Signal on[2];
   end Group;
@@ -431,7 +475,12 @@ def test_connections_of_arrays_of_boolean_connectors_are_loops(tmp_path):
     Signal on[m];
     Switch switch[m];
     Group group, other;
+    LevelOut level;
+    Gate first, second, third if m > 2;
   equation
+    connect(first.y, second.x);
+    connect(level, second.y);
+    connect(first.y, third.x);
     connect(on, switch.on);
     connect(on[1], switch[1].on);
     connect(group.on, other.on);
@@ -440,10 +489,116 @@ end Bank;
 """
     (tmp_path / "Bank.mo").write_text(source)
     new = with_single_connections(Sources([tmp_path]), source)
-    loop = "for k__ in 1:m loop connect(on[k__], switch[k__].on); end for;"
-    other = "for k__ in 1:size(group.on, 1) loop connect(group.on[k__], other.on[k__]); end for;"
-    expected = source.replace("connect(on, switch.on);", loop).replace("connect(group.on, other.on);", other)
+    changes = {
+        "connect(on, switch.on)": "for k__ in 1:m loop switch[k__].on = on[k__]; end for",
+        "connect(on[1], switch[1].on)": "switch[1].on = on[1]",
+        # Nothing says here which of two inputs of parts is given.
+        "connect(group.on, other.on)": "for k__ in 1:size(group.on, 1) loop connect(group.on[k__], other.on[k__]); "
+        "end for",
+        "connect(first.y, second.x)": "second.x = first.y",
+        "connect(level, second.y)": "level = second.y",
+    }
+    expected = functools.reduce(lambda text, change: text.replace(*change), changes.items(), source)
     assert new == expected
+
+
+def test_inputs_of_components_are_equal_to_those_of_their_class(tmp_path):
+    """A flip-flop, which opens; what may be absent stays a connection."""
+    source = """package Logic
+  connector In = input Boolean;
+  connector Out = output Boolean;
+  block Nor
+    In a, b;
+    Out y;
+  equation
+    y = not (a or b);
+  end Nor;
+  block Pre
+    In u;
+    Out y;
+  equation
+    y = pre(u);
+  end Pre;
+  block Keeps
+    parameter Boolean more = false;
+    In s, r;
+    In t if more;
+    Out q;
+    Nor first, second;
+    Nor third if more;
+    Pre late;
+  equation
+    connect(s, first.a);
+    connect(second.b, r);
+    connect(t, third.a);
+    connect(r, third.b);
+    connect(second.y, first.b);
+    connect(first.y, late.u);
+    connect(late.y, second.a);
+    connect(second.y, q);
+  end Keeps;
+end Logic;
+"""
+    (tmp_path / "Logic.mo").write_text(source)
+    new = with_single_connections(Sources([tmp_path]), source)
+    made = {
+        "connect(s, first.a)": "first.a = s", "connect(second.b, r)": "second.b = r",
+        "connect(second.y, first.b)": "first.b = second.y", "connect(first.y, late.u)": "late.u = first.y",
+        "connect(late.y, second.a)": "second.a = late.y", "connect(second.y, q)": "q = second.y",
+    }  # fmt: skip
+    assert new == functools.reduce(lambda text, change: text.replace(*change), made.items(), source)
+    assert Library(tmp_path)["Logic.Keeps"].opened.inputs == ("s", "r")
+
+
+def test_open_connectors_count_as_connected(tmp_path):
+    """Alone, a line force found its flanges loose: no force acted."""
+    text = """package Lines
+  connector Flange
+    Real s;
+    flow Real f;
+  end Flange;
+  partial model Two
+    Flange a, b;
+  equation
+    assert(cardinality(b) > 0, "loose");
+  end Two;
+  model Line
+    extends Two;
+    Real force;
+  equation
+    a.s = 0;
+    b.s = 2;
+    if cardinality(a) > 0 then
+      force = a.f;
+    else
+      force = 0;
+    end if;
+  end Line;
+end Lines;
+"""
+    (tmp_path / "Lines.mo").write_text(text)
+    line = Library(tmp_path)["Lines.Line"](EqnEnv(), "line")
+    assert "-a.f + force" in map(str, line.equations)
+
+
+def test_outputs_that_are_held_between_events_drive_inputs():
+    """They were no variables, and nothing could be connected to them."""
+    text = """connector RealInput = input Real;
+connector BooleanOutput = output Boolean;
+block Relay
+  RealInput u;
+  BooleanOutput y;
+equation
+  y = not pre(y) and u > 1 or pre(y) and u >= 0;
+end Relay;
+"""
+    ev, d = EqnEnv(), AcausalDiagram()
+    relay, level, gain = component("Relay", source=text)(ev, "relay"), Constant(ev, "level", 2.0), Gain(ev, "gain", 3.0)
+    d.add(relay, level, gain)
+    d.connect(level.y, relay.u)
+    d.connect(relay, "y", gain, "u")
+    system = AcausalCompiler(ev, d)()
+    assert system.plan.resolve(["gain.u"])[0] == system.plan.resolve(["relay.y"])[0]
 
 
 def test_a_size_without_a_value_is_asked_for():
