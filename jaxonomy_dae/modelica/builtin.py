@@ -82,10 +82,12 @@ def product(value: Value) -> Value:
 
 
 def matrix_product(a: list, b: list) -> Value:
-    """The product of arrays of one or two dimensions."""
+    """The product of arrays of one or two dimensions; that of two vectors without entries is zero."""
     columns = sizes(a)[-1] if a else 0
     if columns != len(b):
         raise ModelError(f"the product of arrays of sizes {sizes(a)} and {sizes(b)}: {columns} is not {len(b)}")
+    if not a:
+        return 0.0
     if not isinstance(a[0], list):
         if not isinstance(b[0], list):
             return total([x * y for x, y in zip(a, b, strict=True)])

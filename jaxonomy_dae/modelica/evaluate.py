@@ -255,6 +255,8 @@ class Evaluator:
 
     def _call(self, e: tree.Call, names: Names) -> Value:
         name = e.function
+        if name in self.classes:  # a function of the text hides one that is built in
+            return self.call(name, *self._arguments(e, names))
         if name in self.special:
             return self.special[name](*e.arguments)
         if name in ("noEvent", "smooth"):
@@ -263,17 +265,19 @@ class Evaluator:
             return self._applied(e.arguments[0], names)
         if name == "der":
             return entrywise(der, self.evaluate(e.arguments[0], names))
-        arguments = [self.evaluate(a, names) for a in e.arguments]
-        named = {k: self.evaluate(v, names) for k, v in e.named}
+        arguments, named = self._arguments(e, names)
         if name in FUNCTIONS:
             return applied(name, arguments, named)
         # A function that is an argument is called by the argument's name.
-        if name not in self.classes and "." not in name:
+        if "." not in name:
             try:
                 return names(name)(*arguments, **named)
             except KeyError:
                 pass
         return self.call(name, arguments, named)
+
+    def _arguments(self, e: tree.Call, names: Names) -> tuple[list[Value], dict[str, Value]]:
+        return [self.evaluate(a, names) for a in e.arguments], {k: self.evaluate(v, names) for k, v in e.named}
 
     def _without_events(self, e: tree.Call, names: Names) -> Value:
         if e.function == "smooth" and self.constant(e.arguments[0], names) == 0:
@@ -341,9 +345,17 @@ def local_names(local: Mapping[str, Value], outer: Names) -> Names:
             if value is None:
                 raise ModelError(f"'{name}' is read before it is assigned")
             return value
+        # An entry or a field of a local variable is not that of a variable of the model with the same name.
+        if beginning(name) in local:
+            raise KeyError(name)
         return outer(name)
 
     return names
+
+
+def beginning(name: str) -> str:
+    """The first part of a name, without its subscripts."""
+    return name.partition("[")[0].partition(".")[0]
 
 
 def _refused(_: Evaluator, e: object, __: Names) -> NoReturn:

@@ -27,7 +27,7 @@ from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
-from .tree import Assignment, Call, Class, Declaration, Equality, Expression, Reference, Truth, each_part, entry_name
+from .tree import Assignment, Call, Class, Declaration, Equality, Expression, Reference, each_part, entry_name
 from .values import Record, Value, as_number, both, is_condition, negated, plain
 from .written_out import entries_of, unrolled
 
@@ -191,7 +191,7 @@ class Scope:
         if self._is_unknown(d):
             return self._unknown_parameter(d)
         if d.value is None and self.kind(d.type) != REAL:
-            value = self._said_initially(d.name) if d.modifiers.get("fixed") == Truth(False) else None
+            value = self._said_initially(d.name) if self._fixed(d) is False else None
             if value is not None:
                 return value
             if "start" in d.modifiers:
@@ -276,7 +276,15 @@ class Scope:
                 self.value(d.name)
 
     def _is_unknown(self, d: Declaration) -> bool:
-        return d.modifiers.get("fixed") == Truth(False) and self.kind(d.type) == REAL
+        return self._fixed(d) is False and self.kind(d.type) == REAL
+
+    def _fixed(self, d: Declaration) -> bool | None:
+        """The attribute `fixed`; None where nothing gives it."""
+        e = d.modifiers.get("fixed")
+        value = None if e is None else self.interpreter.constant(e)
+        if value is not None and not isinstance(value, bool):
+            raise ModelError(f"line {d.line}: 'fixed' of '{d.name}' is true or false; got {value!r}")
+        return value
 
     def _unknown_parameter(self, d: Declaration) -> Value:
         """A parameter that initial equations determine: a variable that does not change. If one of them just says
@@ -335,7 +343,7 @@ class Scope:
         # An input of a part is bound to what drives it, and is an ordinary variable.
         if "input" in d.prefixes and d.value is None:
             return self.component.input(d.name, default=None if start is None else float(start), unit=self._unit(d))
-        fixed = d.modifiers.get("fixed") == Truth(True)
+        fixed = self._fixed(d) is True
         if fixed and start is None:
             start = 0.0
         if d.value is not None:
