@@ -101,7 +101,16 @@ class Evaluator:
             for field, subscripts in zip(e.parts[n:], e.subscripts[n:], strict=True):
                 value = self._entry(_field(value, field), subscripts, names)
             return value
-        raise ModelError(f"'{e.path}' is not declared")
+        if path == "Boolean":
+            return [False, True]
+        if path in self.classes and self.classes[path].literals:  # all values of an enumeration, as in `for e in E`
+            return list(range(1, len(self.classes[path].literals) + 1))
+        raise ModelError(f"'{path}' is not declared")
+
+    def count(self, dimension: tree.Expression, names: Names | None = None) -> int:
+        """The size of a dimension: a number, or that of an enumeration."""
+        found = self.constant(dimension, names)
+        return len(found) if isinstance(found, list) else int(found)
 
     def name_of(self, e: tree.Reference) -> str:
         """The name of a variable that is declared by itself, an entry of an array among them."""
@@ -232,6 +241,8 @@ class Evaluator:
 
     def _range(self, e: tree.Range, names: Names) -> list:
         first, step, last = (self.constant(x, names) for x in (e.first, e.step, e.last))
+        if isinstance(first, bool):
+            return [b for b in (False, True) if first <= b <= last]
         if step == 0:
             raise ModelError(f"the range {first}:0:{last} has no step")
         count = math.floor(round((last - first) / step, 6)) + 1  # rounding: 0.3 / 0.1 is below 3
@@ -325,6 +336,7 @@ def _field(value: Value, name: str) -> Value:
 
 
 def index_of(k: Value, count: int) -> int:
+    k = k + 1 if isinstance(k, bool) else k  # of a dimension that is Boolean
     if not (float(k).is_integer() and 1 <= k <= count):
         raise ModelError(f"the subscript {k} is outside of 1:{count}")
     return int(k) - 1

@@ -146,7 +146,7 @@ class Interpreter(Evaluator):
         for dimension in d.dimensions:
             if isinstance(dimension, tree.Whole):
                 return None
-            counts.append(self.constant(dimension, names))
+            counts.append(self.count(dimension, names))
         if isinstance(empty, Record):
             one = d._replace(dimensions=d.dimensions[1:])
             return [self._unset(one, names) for _ in range(counts[0])] if counts else empty

@@ -20,7 +20,7 @@ from ..write.component import Component
 from ..write.discrete_equations import BEFORE, STARTED, DiscreteEquations
 from ..write.events import terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
-from .definitions import assigned_in, find_definitions
+from .definitions import assigned_in, find_definitions, remembered
 from .flat_model import FlatModel
 from .interpret import Interpreter
 from .left_out import LEFT_OUT
@@ -110,7 +110,7 @@ class Scope:
         declared: list[Declaration] = []
         for d in model.declarations:
             if d.dimensions and not d.prefixes & _CONSTANT and self.kind(d.type) not in _TEXTS:
-                sizes = [self.interpreter.constant(n) for n in d.dimensions]
+                sizes = [self.interpreter.count(n) for n in d.dimensions]
                 declared += located(model.name, d.line, lambda d, n: list(entries_of(d, n, is_array)), d, sizes)
             else:
                 declared.append(d)
@@ -257,9 +257,14 @@ class Scope:
         """What an algorithm assigns."""
         if number not in self.carried_out:
             assigned, kept = self.definitions.assigned[number], self.definitions.stored
-            stored = {n: previous(self.stored(n)) for n in assigned if n in kept}
             statements = self.definitions.algorithms[number]
-            self.carried_out[number] = self.interpreter.assigned_by(statements, stored)
+            # What an algorithm does not assign in every case begins with what it was before, or with its start if it is
+            # not discrete (section 11.1.2).
+            first = {n: previous(self.stored(n)) for n in assigned if n in kept}
+            for n in sorted(remembered(statements, self.flat.model) - first.keys()):
+                start = self._start(self.declared[n].modifiers.get("start"))
+                first[n] = 0.0 if start is None else start
+            self.carried_out[number] = self.interpreter.assigned_by(statements, first)
         return self.carried_out[number]
 
     # --- declarations ------------------------------------------------------------------------------------------------
