@@ -10,6 +10,7 @@ from itertools import islice
 import sympy
 
 from ..base.errors import ModelError, nearest
+from ..write.automatic_events import smooth
 from . import tree
 from .builtin import FUNCTIONS, applied, filled, sizes
 from .definitions import assigned_in
@@ -51,7 +52,8 @@ class Interpreter(Evaluator):
                 raise ModelError(f"the function '{name}' calls '{function.external}', which is written in C")
             local, _ = self._declared(tuple(inputs), given)
             return external(*(local[d.name] for d in inputs))
-        arrays = {d.name for d in inputs if d.name in given and len(sizes(given[d.name])) > len(d.dimensions)}
+        known = [d for d in inputs if d.name in given and (d.type in tree.BUILT_IN or d.type in self.classes)]
+        arrays = {d.name for d in known if len(sizes(given[d.name])) > len(d.dimensions)}
         return self._for_entries(name, given, arrays) if arrays else self._carried_out(function, given)
 
     def _record(self, record: tree.Class, arguments: list[Value], named: dict[str, Value]) -> Record:
@@ -195,7 +197,16 @@ class Interpreter(Evaluator):
         """Assigns what two branches assign: that of `a` where the condition holds."""
         for name in a | b:
             otherwise = False if name in ("return", "break") else local.get(name)
-            local[name] = self._named(_joined(condition, a.get(name, otherwise), b.get(name, otherwise), self.quiet))
+            joined = _joined(condition, a.get(name, otherwise), b.get(name, otherwise), self.quiet)
+            local[name] = self._named_truth(joined) if name in JUMPS else self._named(joined)
+
+    def _named_truth(self, value: Value) -> Value:
+        """Whether a jump has happened, by a name for what is long: all that follows asks for it."""
+        if isinstance(value, bool):
+            return value
+        number = smooth(as_number(value))
+        named = self._named(number)
+        return value if named is number else sympy.Eq(named, 1)
 
     def _assign(self, target: tree.Expression, value: Value, local: dict[str, Value], names: Names) -> None:
         if isinstance(target, tree.Several):

@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 
+BUILT_IN = ("Real", "Integer", "Boolean", "String")
+
+
 class Number(NamedTuple):
     """A literal: `value` is a float, or an int where the text has neither point nor exponent."""
 
