@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-
 BUILT_IN = ("Real", "Integer", "Boolean", "String")
 
 
