@@ -83,11 +83,11 @@ def product(value: Value) -> Value:
 
 def matrix_product(a: list, b: list) -> Value:
     """The product of arrays of one or two dimensions; that of two vectors without entries is zero."""
-    columns = sizes(a)[-1] if a else 0
+    if not a:
+        return [] if b else 0.0
+    columns = sizes(a)[-1]
     if columns != len(b):
         raise ModelError(f"the product of arrays of sizes {sizes(a)} and {sizes(b)}: {columns} is not {len(b)}")
-    if not a:
-        return 0.0
     if not isinstance(a[0], list):
         if not isinstance(b[0], list):
             return total([x * y for x, y in zip(a, b, strict=True)])
@@ -154,7 +154,12 @@ def _linspace(first: Value, last: Value, count: int) -> list:
 
 
 def _size(value: Value, dimension: int | None = None) -> Value:
-    return sizes(value) if dimension is None else sizes(value)[int(dimension) - 1]
+    found = sizes(value)
+    if dimension is None:
+        return found
+    if not 1 <= dimension <= len(found):
+        raise ModelError(f"the size of dimension {dimension} of an array with the sizes {found}")
+    return found[int(dimension) - 1]
 
 
 def _integer(x: Value) -> Value:

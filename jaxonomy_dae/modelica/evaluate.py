@@ -59,13 +59,15 @@ class Evaluator:
         named: Callable[[sympy.Expr], Value] = lambda e: e,
         opaque: Callable[[Callable, Sequence[Value], int, str], Sequence[Value]] = lambda *_: (),
     ):
-        self.classes, self.names, self.entries = classes, names, entries or {}
+        self.classes, self.names = classes, names
+        self.entries = {} if entries is None else entries  # an empty one may be filled later
         self.special, self.externals = special, externals
         self.literals = literal_numbers(classes)
         self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
         self.quieted = Quieted()
         self.named, self.opaque = named, opaque
         self.depth = 0
+        self.around = names  # where a special call stands: the iterators of loops are among them
         self.guards: list[Value] = []  # conditions that are not constant, around what is carried out
 
     # --- expressions -------------------------------------------------------------------------------------------------
@@ -80,10 +82,14 @@ class Evaluator:
         return _EVALUATED[type(e)](self, e, names or self.names)
 
     def _reference(self, e: tree.Reference, names: Names) -> Value:
+        return self.referred(e, names, names)
+
+    def referred(self, e: tree.Reference, names: Names, inside: Names) -> Value:
+        """What a reference stands for; `inside` are the names in its subscripts."""
         path = e.path
         if path in self.literals:
             return self.literals[path]
-        written = self._entry_name(e, names) if any(e.subscripts) else path
+        written = self._entry_name(e, inside) if any(e.subscripts) else path
         if written is not None:
             try:
                 return names(written)
@@ -97,9 +103,9 @@ class Evaluator:
                 continue
             if any(e.subscripts[: n - 1]):
                 continue
-            value = self._entry(value, e.subscripts[n - 1], names)
+            value = self._entry(value, e.subscripts[n - 1], inside)
             for field, subscripts in zip(e.parts[n:], e.subscripts[n:], strict=True):
-                value = self._entry(_field(value, field), subscripts, names)
+                value = self._entry(_field(value, field), subscripts, inside)
             return value
         if path == "Boolean":
             return [False, True]
@@ -111,6 +117,25 @@ class Evaluator:
         """The size of a dimension: a number, or that of an enumeration."""
         found = self.constant(dimension, names)
         return len(found) if isinstance(found, list) else int(found)
+
+    def local_names(self, local: Mapping[str, Value], outer: Names) -> Names:
+        """The names in a function or algorithm: those of `local` hide others."""
+
+        def names(name: str) -> Value:
+            if name in local:
+                value = local[name]
+                if value is None:
+                    raise ModelError(f"'{name}' is read before it is assigned")
+                return value
+            # An entry or a field of a local variable is not that of a variable of the model with the same name.
+            if beginning(name) in local:
+                raise KeyError(name)
+            places = self.entries.get(name, ())
+            if any(tree.entry_name(name, p) in local for p in places):  # an algorithm has assigned some of them
+                return array_of(name, places, names)
+            return outer(name)
+
+        return names
 
     def name_of(self, e: tree.Reference) -> str:
         """The name of a variable that is declared by itself, an entry of an array among them."""
@@ -269,7 +294,11 @@ class Evaluator:
         if name in self.classes:  # a function of the text hides one that is built in
             return self.call(name, *self._arguments(e, names))
         if name in self.special:
-            return self.special[name](*e.arguments)
+            before, self.around = self.around, names
+            try:
+                return self.special[name](*e.arguments)
+            finally:
+                self.around = before
         if name in ("noEvent", "smooth"):
             return self._without_events(e, names)
         if name == FUNCTION:
@@ -350,19 +379,16 @@ def with_end(names: Names, count: int) -> Names:
     return _with(names, "end", count)
 
 
-def local_names(local: Mapping[str, Value], outer: Names) -> Names:
-    def names(name: str) -> Value:
-        if name in local:
-            value = local[name]
-            if value is None:
-                raise ModelError(f"'{name}' is read before it is assigned")
-            return value
-        # An entry or a field of a local variable is not that of a variable of the model with the same name.
-        if beginning(name) in local:
-            raise KeyError(name)
-        return outer(name)
-
-    return names
+def array_of(name: str, places: Sequence[tuple[int, ...]], value_of: Names, depth: int = 0) -> list:
+    """The array of the entries at these places, which have equal numbers before `depth`."""
+    out = []
+    for k in sorted({p[depth] for p in places}):
+        inside = [p for p in places if p[depth] == k]
+        if len(inside[0]) > depth + 1:
+            out.append(array_of(name, inside, value_of, depth + 1))
+        else:
+            out.append(value_of(tree.entry_name(name, inside[0])))
+    return out
 
 
 def beginning(name: str) -> str:

@@ -14,7 +14,7 @@ from ..write.automatic_events import smooth
 from . import tree
 from .builtin import FUNCTIONS, applied, filled, sizes
 from .definitions import assigned_in
-from .evaluate import Evaluator, Names, beginning, index_of, local_names, with_end
+from .evaluate import Evaluator, Names, beginning, index_of, with_end
 from .loops import JUMPS, MOST, at, carried, placed, repeated
 from .values import Record, Results, Value, as_number, both, chosen, either, is_condition, negated
 
@@ -88,7 +88,7 @@ class Interpreter(Evaluator):
         reads another one comes after it, wherever that is declared (section 12.4.4)."""
         local: dict[str, Value] = {}
         waiting = {d.name: d for d in declarations}
-        inner = local_names(local, self.names)
+        inner = self.local_names(local, self.names)
 
         def names(name: str) -> Value:
             settle(beginning(name))
@@ -159,7 +159,7 @@ class Interpreter(Evaluator):
     def assigned_by(self, statements: tuple[tree.Statement, ...], first: Mapping[str, Value] | None = None) -> dict:
         """What an algorithm of the model assigns; `first` are values before it."""
         local: dict[str, Value] = dict(first or {})
-        self.execute(statements, local, lambda name: local[name] if name in local else self.names(name))
+        self.execute(statements, local, self.local_names(local, self.names))
         return local
 
     def execute(self, statements: tuple[tree.Statement, ...], local: dict[str, Value], names: Names) -> None:
@@ -177,7 +177,7 @@ class Interpreter(Evaluator):
                 continue
             copied = dict(local)
             self.guards.append(negated(ended))
-            self._statement(s, copied, local_names(copied, names))
+            self._statement(s, copied, self.local_names(copied, names))
             self.guards.pop()
             self._join(ended, dict(local), copied, local)
 
@@ -272,7 +272,7 @@ class Interpreter(Evaluator):
             for condition, statements in ((holds, body), (negated(holds), (rest,))):
                 copied = dict(local)
                 self.guards.append(condition)
-                self.execute(statements, copied, local_names(copied, names))
+                self.execute(statements, copied, self.local_names(copied, names))
                 self.guards.pop()
                 results.append(copied)
             self._join(holds, results[0], results[1], local)
@@ -313,7 +313,7 @@ class Interpreter(Evaluator):
         # Names would be equations of the model, outside of the loop, where what a round reads has no value.
         named, guards, self.named, self.guards = self.named, self.guards, lambda e: e, []
         try:
-            within = local_names(inside, names)
+            within = self.local_names(inside, names)
             ended = either(*(inside.get(j, False) for j in JUMPS))
             goes_on = both(self.evaluate(condition, within), negated(ended))
             self.execute(body, inside, within)

@@ -21,13 +21,14 @@ from ..write.discrete_equations import BEFORE, STARTED, DiscreteEquations
 from ..write.events import terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
 from .definitions import assigned_in, find_definitions, remembered
+from .evaluate import array_of
 from .flat_model import FlatModel
 from .interpret import Interpreter
 from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
-from .tree import Assignment, Call, Class, Declaration, Equality, Expression, Reference, each_part, entry_name
+from .tree import Assignment, Call, Class, Declaration, Equality, Expression, Reference, Statement, each_part
 from .values import Record, Value, as_number, both, is_condition, negated, plain
 from .written_out import entries_of, unrolled
 
@@ -47,7 +48,7 @@ class Scope:
     - `definitions`: which statement determines which variable.
     - `discrete`: the discrete equations; `kept`: relations whose truth is kept between events.
     - `names`: names of long expressions of functions.
-    - `carried_out`: what algorithms assign, by their numbers.
+    - `carried_out`: what algorithms assign, by their numbers; `assigned_first`: what initial algorithms assign.
     - `said`: the discrete variables of which initial equations say what they are. `waiting`: initial equations of
       discrete variables that wait for others, which they do while `postpones` is true.
     - `as_numbers`: True while parameters are read as their values, which are final then.
@@ -90,6 +91,7 @@ class Scope:
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
         self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.carried_out: dict[int, dict[str, Value]] = {}
+        self.assigned_first: dict[tuple[Statement, ...], dict[str, Value]] = {}
         self.said: set[DiscreteSymbol] = set()
         self.waiting: list[tuple[Value, Value]] = []
         self.postpones = True
@@ -164,21 +166,10 @@ class Scope:
     def _gathered(self, name: str) -> Value:
         """An array or a record whose entries are declared one by one."""
         if name in self.entries:
-            return self._array_of(name, self.entries[name], 0)
+            return array_of(name, self.entries[name], self.value)
         if name in self.fields:
             return Record({f: self.value(f"{name}.{f}") for f in self.fields[name]})
         raise KeyError(name)
-
-    def _array_of(self, name: str, places: list[tuple[int, ...]], depth: int) -> Value:
-        """The array of the entries at these places, which have equal numbers before `depth`."""
-        out = []
-        for k in sorted({p[depth] for p in places}):
-            inside = [p for p in places if p[depth] == k]
-            if len(inside[0]) > depth + 1:
-                out.append(self._array_of(name, inside, depth + 1))
-            else:
-                out.append(self.value(entry_name(name, inside[0])))
-        return out
 
     def _constant(self, d: Declaration) -> Value:
         """The value of a parameter: a symbol for a Real, which is then a parameter of the component."""
@@ -208,9 +199,9 @@ class Scope:
         for statements in self.flat.model.initial_algorithms:
             if name not in assigned_in(statements):
                 continue
-            local = self.interpreter.assigned_by(statements)
-            self.known.update(local)
-            return local.get(name)
+            if statements not in self.assigned_first:
+                self.assigned_first[statements] = self.interpreter.assigned_by(statements)
+            return self.assigned_first[statements].get(name)
         return None
 
     def _as_parameter(self, d: Declaration, value: Value) -> Value:
@@ -420,7 +411,7 @@ class Scope:
         return read(table, column, u, *more)
 
     def _pre(self, e: Expression) -> Value:
-        value = self.evaluate(e)
+        value = self._now(e)
         for s in _variables(value):
             # A state jumps by `reinit` alone, at the end of an iteration: until then it is what it was before.
             if not s.path.startswith(":") and s.path not in self.states:
@@ -428,7 +419,18 @@ class Scope:
                     f"pre({s.path}): '{s.path}' is neither discrete nor a state, and may jump with others at the "
                     f"instant: what it was before is not kept. Write pre(…) of what its equation reads"
                 )
-        return previous(value)
+        return self._previous(e)
+
+    def _previous(self, e: Expression) -> Value:
+        """A variable in the iteration before. Its subscripts choose it as they are now."""
+        if not isinstance(e, Reference):
+            return previous(self.evaluate(e))
+        return self.interpreter.referred(e, lambda name: previous(self.value(name)), self.interpreter.around)
+
+    def _now(self, e: Expression) -> Value:
+        if not isinstance(e, Reference):
+            return self.evaluate(e)
+        return self.interpreter.referred(e, self.value, self.interpreter.around)
 
     @functools.cached_property
     def states(self) -> set[str]:
@@ -438,18 +440,20 @@ class Scope:
         return {s.path for c in calls for s in _variables(self.evaluate(c.arguments[0]))}
 
     def _edge(self, e: Expression) -> Value:
-        now = self.evaluate(e)
-        return both(now, negated(previous(now)))
+        now = self._now(e)
+        return both(now, negated(self._previous(e)))
 
     def _change(self, e: Expression) -> Value:
-        now = self.evaluate(e)
-        return negated(plain(sympy.Eq(as_number(now), as_number(previous(now)))))
+        now = self._now(e)
+        return negated(plain(sympy.Eq(as_number(now), as_number(self._previous(e)))))
 
     def _is_initial(self) -> Value:
         return negated(self.discrete.phase(STARTED))
 
     def _sample(self, start: Expression, interval: Expression) -> Value:
-        return self.discrete.tick(self.component.sampled(self.evaluate(interval), self.evaluate(start)))
+        return self.discrete.tick(
+            self.component.sampled(*(self.interpreter.evaluate(e, self.interpreter.around) for e in (interval, start)))
+        )
 
 
 def _is_of_parameters(value: sympy.Expr) -> bool:

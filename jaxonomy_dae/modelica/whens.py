@@ -65,7 +65,7 @@ class _Algorithm:
         self.once: dict[str, Value] = {}
 
     def names(self, name: str) -> Value:
-        return self.local[name] if name in self.local else self.scope.value(name)
+        return self.scope.interpreter.local_names(self.local, self.scope.value)(name)
 
     def carry_out(self, s: tree.Statement) -> None:
         if isinstance(s, tree.Effect):
@@ -172,7 +172,7 @@ def _each_action(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tup
 def _of_loops(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tuple[Target, Value]]:
     """What loops of equations assign."""
     local: dict[str, Value] = {}
-    scope.interpreter.execute(body, local, lambda n: local[n] if n in local else scope.value(n))
+    scope.interpreter.execute(body, local, scope.interpreter.local_names(local, scope.value))
     for n in with_entries(assigned_in(body), scope.flat.model):
         if n in scope.definitions.stored and n in local:
             yield DiscreteSymbol(n), local[n]

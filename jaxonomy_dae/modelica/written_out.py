@@ -48,12 +48,19 @@ def entries_of(
             e, place = e.entries[k - 1], place[1:]
         return e
 
+    if 0 in sizes:  # the empty array is all that there is to know
+        yield d._replace(prefixes=frozenset({"constant"}), dimensions=(), value=_empty(sizes))
+        return
     for place in itertools.product(*(range(1, n + 1) for n in sizes)):
         yield d._replace(
             name=tree.entry_name(d.name, place), dimensions=(),
             modifiers={k: v if isinstance(v, dict) else part(v, place) for k, v in d.modifiers.items()},
             value=None if d.value is None else part(d.value, place),
         )  # fmt: skip
+
+
+def _empty(sizes: Sequence[int]) -> tree.Array:
+    return tree.Array((_empty(sizes[1:]),) * sizes[0] if sizes[0] else ())
 
 
 def _with(part: Any, values: Mapping[str, tree.Number]) -> Any:
