@@ -29,7 +29,7 @@ def test_a_when_assigns_a_whole_array():
 
 def test_a_subscript_within_pre_is_the_present_one():
     more = " Integer 'k'(start = 1, fixed = true); Integer 'j'(start = 0, fixed = true);"
-    found = equations(DISCRETE + more, "when time > 1 then 'k' = 2; 'j' = pre('n'['k']); end when;")
+    found = equations(DISCRETE + more, "when time > 1 then 'k' = 2; 'n' = {1, 2}; 'j' = pre('n'['k']); end when;")
     assert new_value("j", found) == "Piecewise((:pre(n[1]), Eq(:when:new[k], 1)), (:pre(n[2]), True))"
 
 
