@@ -103,7 +103,8 @@ class Instance:
         out = np.zeros(len(self._read))
         for kind, places in self._of_type.items():
             references = [self.described.reference(self._read[k]) for k in places]
-            suffix = kind if kind != "Enumeration" else "Integer"
+            whole = "Integer" if self.described.version == 2 else "Int64"
+            suffix = whole if kind == "Enumeration" else kind
             try:
                 out[places] = getattr(self.model, f"get{suffix}")(references)
             except Exception as error:

@@ -30,7 +30,7 @@ from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
 from .tree import Assignment, Call, Class, Declaration, Equality, Expression, Reference, Statement, each_part
 from .values import Record, Value, as_number, both, is_condition, negated, plain
-from .written_out import entries_of, unrolled
+from .written_out import entries_of, fields_of, unrolled
 
 REAL = "Real"
 _TEXTS = ("String", "StateSelect", "AssertionLevel")
@@ -110,14 +110,29 @@ class Scope:
             return isinstance(self.evaluate(e), list)
 
         declared: list[Declaration] = []
-        for d in model.declarations:
-            if d.dimensions and not d.prefixes & _CONSTANT and self.kind(d.type) not in _TEXTS:
+        waiting = list(reversed(model.declarations))
+        while waiting:
+            d = waiting.pop()
+            record = self._record_of(d)
+            if record is not None and not d.dimensions:
+                waiting += reversed(list(fields_of(d, record)))
+            elif d.dimensions and (record or not d.prefixes & _CONSTANT and self.kind(d.type) not in _TEXTS):
                 sizes = [self.interpreter.count(n) for n in d.dimensions]
-                declared += located(model.name, d.line, lambda d, n: list(entries_of(d, n, is_array)), d, sizes)
+                entries = located(model.name, d.line, lambda d, n: list(entries_of(d, n, is_array)), d, sizes)
+                if record is None:
+                    declared += entries
+                else:
+                    waiting += reversed(entries)
             else:
                 declared.append(d)
         equations, initial = (unrolled(s, values_of) for s in (model.equations, model.initial_equations))
         return model._replace(declarations=tuple(declared), equations=equations, initial_equations=initial)
+
+    def _record_of(self, d: Declaration) -> Class | None:
+        """The record of which a variable is one; a constant that has a value stays whole."""
+        of = self.flat.classes.get(d.type)
+        whole = d.value is not None and d.prefixes & _CONSTANT
+        return None if of is None or of.kind != "record" or whole else of
 
     def evaluate(self, e: Expression) -> Value:
         return self.interpreter.evaluate(e)
@@ -338,7 +353,11 @@ class Scope:
         start = self._start(d.modifiers.get("start"))
         # An input of a part is bound to what drives it, and is an ordinary variable.
         if "input" in d.prefixes and d.value is None:
-            return self.component.input(d.name, default=None if start is None else float(start), unit=self._unit(d))
+            # One in parameters would not follow them.
+            default = None if isinstance(start, sympy.Expr) and start.free_symbols else start
+            return self.component.input(
+                d.name, default=None if default is None else float(default), unit=self._unit(d)
+            )  # fmt: skip
         fixed = self._fixed(d) is True
         if fixed and start is None:
             start = 0.0

@@ -9,6 +9,7 @@ import sympy
 from ..base.errors import ModelError
 from ..write.symbols import DiscreteSymbol, VariableSymbol
 from . import tree
+from .continuous import pairs
 from .definitions import assigned_in, with_entries
 from .scope import Scope, previous
 from .values import Value, as_condition, as_number, both, chosen, negated
@@ -156,7 +157,9 @@ def _each_action(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tup
         if isinstance(s, tree.Effect):
             name, arguments = s.call.function, s.call.arguments
             if name == "reinit":
-                yield scope.evaluate(arguments[0]), sympy.sympify(scope.evaluate(arguments[1]))
+                states, values = map(scope.evaluate, arguments)
+                for state, value in pairs(states, values):
+                    yield state, sympy.sympify(value)
             elif name == "terminate":
                 yield str(scope.evaluate(arguments[0])), None
         elif isinstance(s, tree.Equality | tree.Assignment):

@@ -61,3 +61,11 @@ def test_initial_algorithms_leave_variables_variables():
     )
     assert [str(e) for e in c.equations] == ["der(x) - 1", "-p + der(y)"]
     assert c.parameters["p"].value == 3 and float(c.variables["y"].start) == 6 and c.variables["y"].fixed
+
+
+def test_an_array_of_states_starts_anew():
+    body = "der('q') = {1, 2}; when time > 1 then reinit('q', {10, 20}); end when;"
+    found = equations("Real 'q'[2](each start = 0.0, each fixed = true);", body)
+    assert [e for e in found if e.startswith(":when:reinit")] == [
+        f":when:reinit[q[{k}]] - Piecewise(({10 * k}, Eq(:when:acts[1], 1)), (q[{k}], True))" for k in (1, 2)
+    ]

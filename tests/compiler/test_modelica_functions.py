@@ -1,6 +1,7 @@
 """Functions, records and types of flat Modelica texts: which variable a name stands for, and what it starts with."""
 
 import pytest
+import sympy
 from modelica_texts import built
 
 
@@ -97,3 +98,20 @@ def test_an_algorithm_begins_with_starts():
     y, z = (str(e) for e in c.equations[1:3])
     assert y == "-x + y - 5.0"
     assert z.startswith("z - Piecewise((1, ") and z.endswith(", (0.0, True))")
+
+
+def test_variables_that_are_records():
+    c = built(
+        "package 'P' record 'R' Real 'a'; Real 'b' = 2 * 'a'; end 'R'; record 'S' 'R' 'r'; Real 'k' = 'r'.'b'; end 'S'; "
+        "model 'M' parameter 'R' 'q'('a' = 5.0); 'R' 'w'('a'(start = 3.0, fixed = true)); 'R' 's'[2]('a' = {1, 2}); "
+        "'S' 'n'('r'('a' = 'q'.'b')); equation der('w'.'a') = 'w'.'b'; end 'M'; end 'P';"
+    )
+    known = ("w.a", "q.b")
+    unknown = {s for e in c.equations for s in e.free_symbols if str(s) not in known}
+    (found,) = sympy.solve(list(c.equations), list(unknown), dict=True)
+    assert {str(k): str(v) for k, v in found.items()} == {
+        "der(w.a)": "2*w.a", "w.b": "2*w.a", "s[1].a": "1", "s[1].b": "2", "s[2].a": "2", "s[2].b": "4",
+        "n.r.a": "q.b", "n.r.b": "2*q.b", "n.k": "2*q.b",
+    }  # fmt: skip
+    assert c.variables["w.a"].start == 3 and c.variables["w.a"].fixed
+    assert c.parameters["q.a"].value == 5
