@@ -102,7 +102,8 @@ def test_an_algorithm_begins_with_starts():
 
 def test_variables_that_are_records():
     c = built(
-        "package 'P' record 'R' Real 'a'; Real 'b' = 2 * 'a'; end 'R'; record 'S' 'R' 'r'; Real 'k' = 'r'.'b'; end 'S'; "
+        "package 'P' record 'R' Real 'a'; Real 'b' = 2 * 'a'; end 'R'; "
+        "record 'S' 'R' 'r'; Real 'k' = 'r'.'b'; end 'S'; "
         "model 'M' parameter 'R' 'q'('a' = 5.0); 'R' 'w'('a'(start = 3.0, fixed = true)); 'R' 's'[2]('a' = {1, 2}); "
         "'S' 'n'('r'('a' = 'q'.'b')); equation der('w'.'a') = 'w'.'b'; end 'M'; end 'P';"
     )
@@ -113,5 +114,5 @@ def test_variables_that_are_records():
         "der(w.a)": "2*w.a", "w.b": "2*w.a", "s[1].a": "1", "s[1].b": "2", "s[2].a": "2", "s[2].b": "4",
         "n.r.a": "q.b", "n.r.b": "2*q.b", "n.k": "2*q.b",
     }  # fmt: skip
-    assert c.variables["w.a"].start == 3 and c.variables["w.a"].fixed
+    assert float(c.variables["w.a"].start) == 3 and c.variables["w.a"].fixed
     assert c.parameters["q.a"].value == 5
