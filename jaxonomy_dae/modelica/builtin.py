@@ -35,6 +35,19 @@ def _quotient(a: Value, b: Value) -> Value:
     return smooth(sympy.sign(q)) * sympy.floor(smooth(sympy.Abs(q)))
 
 
+DIVISIONS = ("div", "mod", "rem")
+
+
+def of_whole_numbers(name: str, a: sympy.Expr, b: int) -> Value:
+    """`div`, `mod` or `rem` of whole numbers by one that is not zero. The quotient is moved by half of the distance to
+    the next one: it is computed as a product with 1/b, and 49 (1/49) is less than one."""
+    half = sympy.Rational(1, 2)
+    if name == "mod":
+        return a - b * sympy.floor((a + half * _sign(b)) / b)
+    q = _sign(b) * smooth(sympy.sign(a)) * sympy.floor((smooth(sympy.Abs(a)) + half) / abs(b))
+    return q if name == "div" else a - q * b
+
+
 def _extreme(smaller: bool) -> Callable[..., Value]:
     """`min` or `max` of two values or of the entries of an array. As in Modelica it is not an event."""
     number, symbol = (min, sympy.Min) if smaller else (max, sympy.Max)

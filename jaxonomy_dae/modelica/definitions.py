@@ -114,7 +114,11 @@ def _by_entries(
             yield s
             continue
         for place in places[s.left.path]:
-            entry = _entry_of(s.right, [int(k) for k in place.split(",")])
+            other = s.right.path if isinstance(s.right, tree.Reference) and not any(s.right.subscripts) else ""
+            if place in places.get(other, ()):
+                entry: tree.Expression = tree.Reference((f"{other}[{place}]",))
+            else:
+                entry = _entry_of(s.right, [int(k) for k in place.split(",")])
             yield tree.Equality(tree.Reference((f"{s.left.path}[{place}]",)), entry, s.line)
 
 

@@ -10,7 +10,16 @@ import sympy
 from ..base.errors import ModelError
 from ..write.symbols import VariableSymbol, der
 from . import tree
-from .builtin import FUNCTIONS, applied, matrix_power, matrix_product, numbers_checked, rows_joined
+from .builtin import (
+    DIVISIONS,
+    FUNCTIONS,
+    applied,
+    matrix_power,
+    matrix_product,
+    numbers_checked,
+    of_whole_numbers,
+    rows_joined,
+)  # fmt: skip
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
 from .read_expressions import FUNCTION
@@ -66,6 +75,7 @@ class Evaluator:
         self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
         self.quieted = Quieted()
         self.named, self.opaque = named, opaque
+        self.is_integer: Callable[[str], bool] = lambda name: False  # true for Integer variables
         self.depth = 0
         self.around = names  # where a special call stands: the iterators of loops are among them
         self.guards: list[Value] = []  # conditions that are not constant, around what is carried out
@@ -306,6 +316,10 @@ class Evaluator:
         if name == "der":
             return entrywise(der, self.evaluate(e.arguments[0], names))
         arguments, named = self._arguments(e, names)
+        if name in DIVISIONS and len(arguments) == 2 and not named:
+            a, b = arguments
+            if isinstance(a, sympy.Expr) and isinstance(b, int) and b and self._is_whole(a):
+                return of_whole_numbers(name, a, b)
         if name in FUNCTIONS:
             return applied(name, arguments, named)
         # A function that is an argument is called by the argument's name.
@@ -315,6 +329,13 @@ class Evaluator:
             except KeyError:
                 pass
         return self.call(name, arguments, named)
+
+    def _is_whole(self, value: sympy.Expr) -> bool:
+        """True for what is seen to be a whole number: sums, products and choices of Integer variables."""
+        parts = sympy.preorder_traversal(value)
+        return all(
+            p.is_Integer if p.is_Number else self.is_integer(str(p)) if p.is_Symbol else not p.is_Pow for p in parts
+        )
 
     def _arguments(self, e: tree.Call, names: Names) -> tuple[list[Value], dict[str, Value]]:
         return [self.evaluate(a, names) for a in e.arguments], {k: self.evaluate(v, names) for k, v in e.named}

@@ -20,6 +20,7 @@ from ..write.component import Component
 from ..write.discrete_equations import BEFORE, STARTED, DiscreteEquations
 from ..write.events import terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
+from .builtin import filled
 from .definitions import assigned_in, find_definitions, remembered
 from .evaluate import array_of
 from .flat_model import FlatModel
@@ -77,6 +78,7 @@ class Scope:
             | {name: functools.partial(self._read_table, EXTERNALS[name]) for name in GET_VALUE},
             self.entries, self._named, self._opaque,
         )  # fmt: skip
+        self.interpreter.is_integer = self._is_integer
         self.discrete = DiscreteEquations(component, self.interpreter.quieted)
         self.kept = self.discrete.kept
         self.as_numbers = False
@@ -153,6 +155,10 @@ class Scope:
             return "Integer"
         return self.kind(c.made_of) if c.made_of is not None else name
 
+    def _is_integer(self, symbol: str) -> bool:
+        d = self.declared.get(symbol.removeprefix(BEFORE).removesuffix(")") if symbol.startswith(BEFORE) else symbol)
+        return d is not None and self.kind(d.type) == "Integer"
+
     def value(self, name: str) -> Value:
         known = self.final if self.as_numbers else self.known
         if name in known:
@@ -206,6 +212,10 @@ class Scope:
             if self.kind(d.type) == REAL and not d.dimensions:
                 start = d.modifiers.get("start")
                 return 0.0 if start is None else self._as_parameter(d, self.evaluate(start))
+            if "start" in d.modifiers:  # of an array
+                start = self.evaluate(d.modifiers["start"])
+                sizes = [self.interpreter.count(n) for n in d.dimensions]
+                return start if isinstance(start, list) else filled(start, *sizes)
             raise ModelError(f"the parameter '{d.name}' has no value")
         return self._as_parameter(d, self.evaluate(d.value))
 

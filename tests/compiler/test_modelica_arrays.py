@@ -1,7 +1,11 @@
 """Arrays of flat Modelica texts that are declared as a whole: in whens, under conditions, in algorithms, without
 entries."""
 
+import sympy
 from modelica_texts import built
+
+from jaxonomy_dae.graph.expressions.from_sympy import read
+from jaxonomy_dae.graph.expressions.kernel import Kernel
 
 STATE = "Real 'x'(start = 0.0, fixed = true);"
 
@@ -69,3 +73,15 @@ def test_an_array_of_states_starts_anew():
     assert [e for e in found if e.startswith(":when:reinit")] == [
         f":when:reinit[q[{k}]] - Piecewise(({10 * k}, Eq(:when:acts[1], 1)), (q[{k}], True))" for k in (1, 2)
     ]
+
+
+def test_quotients_of_integers_are_whole():
+    """49 times the number next to 1/49 is less than one."""
+    body = (
+        "when sample(1, 1) then 'n' = pre('n') + 7; end when; 'y' = div('n', 49) + 10 * mod('n', 49) + rem('n', -49);"
+    )
+    c = built(f"model 'M' Integer 'n'(start = 0, fixed = true); Real 'y'; equation {body} end 'M';")
+    equation = next(e for e in c.equations if "y" in map(str, e.free_symbols))
+    n, y = (next(s for s in equation.free_symbols if str(s) == name) for name in "ny")
+    values = Kernel([read(sympy.solve(equation, y)[0], str)], ["n"])
+    assert [float(values([k], "numpy")[0]) for k in (42, 49, -49, -56)] == [462, 1, -1, 412]
