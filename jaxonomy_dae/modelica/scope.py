@@ -216,7 +216,7 @@ class Scope:
         if d.value is None:
             if self.kind(d.type) == REAL and not d.dimensions:
                 start = d.modifiers.get("start")
-                return 0.0 if start is None else self._as_parameter(d, self.evaluate(start))
+                return float(self._fall_back(d)) if start is None else self._as_parameter(d, self.evaluate(start))
             if "start" in d.modifiers:  # of an array
                 start = self.evaluate(d.modifiers["start"])
                 sizes = [self.interpreter.count(n) for n in d.dimensions]
@@ -284,7 +284,7 @@ class Scope:
             first = {n: previous(self.stored(n)) for n in assigned if n in kept}
             for n in sorted(remembered(statements, self.flat.model) - first.keys()):
                 start = self._start(self.declared[n].modifiers.get("start"))
-                first[n] = 0.0 if start is None else start
+                first[n] = float(self._fall_back(self.declared[n])) if start is None else start
             self.carried_out[number] = self.interpreter.assigned_by(statements, first)
         return self.carried_out[number]
 
@@ -340,15 +340,24 @@ class Scope:
 
     def _declare_stored(self, d: Declaration) -> Value:
         start = self._start(d.modifiers.get("start"))
-        start = self._least(d.type) if start is None else as_number(start)
+        start = self._fall_back(d) if start is None else as_number(start)
         self.component.discrete(d.name, start=start)
         self.discrete.before(d.name)
         if self.kind(d.type) == REAL:
             self.discrete.reals.add(d.name)
         return self.stored(d.name)
 
+    def _fall_back(self, d: Declaration) -> float | int:
+        """What a variable starts at if nothing says so: what is next to zero within its bounds (section 4.9)."""
+        value: float | int = self._least(d.type)
+        for bound, further in (("min", max), ("max", min)):
+            e = d.modifiers.get(bound)
+            limit = None if e is None else self.evaluate(e)
+            value = further(value, limit) if isinstance(limit, int | float) else value
+        return value
+
     def _least(self, type_name: str) -> int:
-        """What a discrete variable starts at if nothing says so: an enumeration at its first literal, others at 0."""
+        """The number next to zero of a type: an enumeration has its first literal, others have 0."""
         c = self.flat.classes.get(type_name)
         if c is not None and c.made_of is not None:
             return self._least(c.made_of)
@@ -375,7 +384,7 @@ class Scope:
             )  # fmt: skip
         fixed = self._fixed(d) is True
         if fixed and start is None:
-            start = 0.0
+            start = float(self._fall_back(d))
         if d.value is not None:
             self.definitions.equations.append(Equality(Reference((d.name,)), d.value, d.line))
         return self.component.variable(
