@@ -12,9 +12,20 @@ from typing import Any
 from .builtin import FUNCTIONS
 from .flat_model import FlatModel
 from .sources import Constant, Found, Member, Sources
-from .tree import Call, Class, Comprehension, Declaration, Effect, Loop, Part, Reference, Statement, each_part
+from .tree import (
+    BUILT_IN,
+    Call,
+    Class,
+    Comprehension,
+    Declaration,
+    Effect,
+    Loop,
+    Part,
+    Reference,
+    Statement,
+    each_part,
+)
 
-_BUILT_IN = ("Real", "Integer", "Boolean", "String")
 _RECORDS = ("record", "class")
 
 
@@ -116,12 +127,13 @@ class _Writer:
         )  # fmt: skip
 
     def _type(self, name: str, scopes: Sequence[Found]) -> tuple[str, tuple]:
-        """(A built-in type or the name of a record or enumeration, dimensions that belong to the type)."""
-        if name in _BUILT_IN:
+        """(A built-in type or the name of a record or enumeration, dimensions that belong to the type); the name as it
+        is for a type that no source holds."""
+        if name in BUILT_IN:
             return name, ()
         found = self.library.class_of(name, scopes)
         if found is None:
-            return "Real", ()
+            return name, ()  # it may be an array
         alias = found.source.alias
         if alias is not None:
             kind, more = self._type(alias.type, found.scopes)

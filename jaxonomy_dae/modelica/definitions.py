@@ -44,7 +44,11 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
     """Splits the statements of a model."""
     whens = list(whens_in(model.equations))
     rest = [s for s in model.equations if s not in whens] if whens else list(model.equations)
-    others = _with_choices(_by_entries(rest, model, is_discrete), is_discrete)
+
+    def by_entries(statements: Iterable[tree.Statement]) -> Iterator[tree.Statement]:
+        return _by_entries(statements, model, is_discrete)
+
+    others = _with_choices(by_entries(rest), is_discrete, by_entries)
     sections = [section for section in model.algorithms if any(whens_in(section))]
     by_when = set(with_entries(assigned_in((*whens, *(w for section in sections for w in whens_in(section)))), model))
     # In an algorithm with a when, what stands outside of it is kept, too: statements before and after read each other.
@@ -110,7 +114,11 @@ def _by_entries(
             yield s
             continue
         for place in places[s.left.path]:
-            entry = _entry_of(s.right, [int(k) for k in place.split(",")])
+            other = s.right.path if isinstance(s.right, tree.Reference) and not any(s.right.subscripts) else ""
+            if place in places.get(other, ()):
+                entry: tree.Expression = tree.Reference((f"{other}[{place}]",))
+            else:
+                entry = _entry_of(s.right, [int(k) for k in place.split(",")])
             yield tree.Equality(tree.Reference((f"{s.left.path}[{place}]",)), entry, s.line)
 
 
@@ -124,7 +132,10 @@ def _entry_of(e: tree.Expression, place: list[int]) -> tree.Expression:
     return tree.Part(e, None, tuple(map(tree.Number, place)))
 
 
-def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool]) -> list[tree.Statement]:
+def _with_choices(
+    statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool],
+    by_entries: Callable[[Iterable[tree.Statement]], Iterable[tree.Statement]],
+) -> list[tree.Statement]:  # fmt: skip
     """The statements with an equation for each discrete variable that all branches of an `if` determine."""
     out: list[tree.Statement] = []
     for s in statements:
@@ -132,7 +143,7 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
             out.append(s)
             continue
         conditions = [c for c, _ in s.branches]
-        bodies = [_with_choices(body, is_discrete) for _, body in s.branches]
+        bodies = [_with_choices(by_entries(body), is_discrete, by_entries) for _, body in s.branches]
         values = [
             {_name(e.left): e.right for e in body
              if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(_name(e.left))}

@@ -74,7 +74,7 @@ class RumocaExpressions:
         of = self.storage["domains"][domain]
         outer = [] if of.get("parent") is None else self.binders(of["parent"])
         own = enumerate(of["domain"]["binders"])
-        return outer + [((domain, k), range(b["lower"], b["upper"] + 1, b["step"])) for k, b in own]
+        return outer + [((domain, k), _values(b)) for k, b in own]
 
     def condition(self, number: int) -> tree.Expression:
         entry = self.storage["conditions"][number]
@@ -142,7 +142,13 @@ class RumocaExpressions:
         if kind == "index":
             return self._indexed(inside, first, places)
         if kind == "comprehension":
-            own = [(key, values) for key, values in self.binders(inside["domain"]) if key not in places]
+            # The domain around it is that of a loop, or of the array that the whole equation is about.
+            own = [(key, values) for key, values in self.binders(inside["domain"]) if key[0] == inside["domain"]]
+            names = [b["display_name"] for b in self.storage["domains"][inside["domain"]]["domain"]["binders"]]
+            # rumoca lets the first iterator count the rows: the last one does (section 10.4.1.1). What it writes itself
+            # for arrays has their order.
+            if not all(name.startswith(("__", "vectorized_call_")) for name in names):
+                own.reverse()
             return self._comprehended(own, inside["body"], places)
         if kind == "field":
             field = self.types[self._record_type(inside["base"])]["record_fields"][inside["field"]]["name"]
@@ -318,7 +324,7 @@ class RumocaExpressions:
                 yield tree.Assignment(tree.Reference((names[a["target"]],)), tree.Reference((f":{k}",)), line)
         elif kind == "for":
             ranges = [
-                (_binder(*key), tree.Range(tree.Number(r.start), tree.Number(r.step), tree.Number(r.stop - 1)))
+                (_binder(*key), tree.Range(*map(tree.Number, (r.start, r.step, r[-1] if r else r.start - r.step))))
                 for key, r in self.binders(inside["domain"])
                 if key[0] == inside["domain"]
             ]
@@ -389,6 +395,12 @@ def _change(e: tree.Binary) -> tree.Expression:
         if e.operator == "and" and other is not e.right:
             return tree.Call("edge", other.arguments, ())
     return e
+
+
+def _values(binder: Json) -> range:
+    """The values of a binder, the last one included; its step may be negative."""
+    step = binder["step"]
+    return range(binder["lower"], binder["upper"] + (1 if step > 0 else -1), step)
 
 
 def _binder(domain: int, ordinal: int) -> str:

@@ -9,6 +9,7 @@ import sympy
 from ..base.errors import ModelError
 from ..write.symbols import DiscreteSymbol, VariableSymbol
 from . import tree
+from .continuous import pairs
 from .definitions import assigned_in, with_entries
 from .scope import Scope, previous
 from .values import Value, as_condition, as_number, both, chosen, negated
@@ -69,7 +70,7 @@ class _Algorithm:
         self.once: dict[str, Value] = {}
 
     def names(self, name: str) -> Value:
-        return self.local[name] if name in self.local else self.scope.value(name)
+        return self.scope.interpreter.local_names(self.local, self.scope.value)(name)
 
     def carry_out(self, s: tree.Statement) -> None:
         if isinstance(s, tree.Effect):
@@ -160,7 +161,9 @@ def _each_action(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tup
         if isinstance(s, tree.Effect):
             name, arguments = s.call.function, s.call.arguments
             if name == "reinit":
-                yield scope.evaluate(arguments[0]), sympy.sympify(scope.evaluate(arguments[1]))
+                states, values = map(scope.evaluate, arguments)
+                for state, value in pairs(states, values):
+                    yield state, sympy.sympify(value)
             elif name == "terminate":
                 yield str(scope.evaluate(arguments[0])), None
         elif isinstance(s, tree.Equality | tree.Assignment):
@@ -176,7 +179,7 @@ def _each_action(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tup
 def _of_loops(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tuple[Target, Value]]:
     """What loops of equations assign."""
     local: dict[str, Value] = {}
-    scope.interpreter.execute(body, local, lambda n: local[n] if n in local else scope.value(n))
+    scope.interpreter.execute(body, local, scope.interpreter.local_names(local, scope.value))
     for n in with_entries(assigned_in(body), scope.flat.model):
         if n in scope.definitions.stored and n in local:
             yield DiscreteSymbol(n), local[n]
