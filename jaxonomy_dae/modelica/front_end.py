@@ -23,6 +23,7 @@ _UNROOTED = re.compile(
 _DECIDES = re.compile(
     r"not parameter-evaluable: unknown variable: ([\w.]+)|unresolved component dimension for [\w.]+: (\w+)"
 )
+_CONDITION = re.compile(r"conditional component `([\w.]+)` requires parameter expression")
 _UNCLOCKED = re.compile(
     r"unresolved clock schedule|no exact connected clock owner|no inferred clock constructor"
     r"|must belong to a proven clock partition|the required exact clock owner|requires an owning clocked when-clause"
@@ -153,6 +154,11 @@ class FrontEnd:
             which = "are too many" if equations > unknowns else "lack one"
             counts = f"{_count(equations, 'equation')} for {_count(unknowns, 'unknown')}"
             return f"'{called or last}' has {counts}; rumoca does not say which of them {which}"
+        if found := _CONDITION.search(error):
+            return (
+                f"nothing says whether there is a '{found[1]}': the class gives no value to the parameter that decides "
+                "it; component(…, parameter=True)"
+            )
         if found := _DECIDES.search(error):
             name = found[1] or found[2]
             return f"the class gives no value to '{name}', which decides its equations: component(…, {name}=…)"

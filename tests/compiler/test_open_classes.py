@@ -609,6 +609,13 @@ def test_a_size_without_a_value_is_asked_for():
     assert [d.name for d in declared] == ["n", "x[1]", "x[2]"]
 
 
+def test_a_condition_without_a_value_is_asked_for():
+    text = "model Port parameter Boolean used(start = true); Real x = time if used; Real y = 1; end Port;"
+    with pytest.raises(ModelError, match=r"nothing says whether there is a 'x': the class gives no value"):
+        component("Port", source=text)
+    assert "x" in {d.name for d in component("Port", source=text, used=True).opened.flat.model.declarations}
+
+
 def test_parameters_that_decide_equations_are_not_symbols():
     """The loss of a lossless gear: `ideal` was known to the front end, which chose equations by it, and other losses
     were taken and had no effect."""

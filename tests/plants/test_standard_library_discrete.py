@@ -84,12 +84,12 @@ def test_clocked_controllers_means_and_switches(library):
         d.connect(r.n, v.n, g.p)
     system = AcausalCompiler(ev, d)()
     values = {"pi.k": 1.5, "pi.T": 0.5, "lag.T": 0.4, "sine.amplitude": 1.5}
-    ts = jnp.array([0.1, 0.3, 0.45, 0.7, 1.1])
+    ts = np.array([0.1, 0.3, 0.45, 0.7, 1.1])
     names = ["lag.y", "mean.y", "r0.i", "r1.i"]
     found, slopes = run_with_slopes(system, values, ts, names, ["lag.y", "mean.y"])
 
     def by_hand(k, T, tau, amplitude):
-        x, v, out, left = 0.0, 0.0, [], list(np.asarray(ts))
+        x, v, out, left = 0.0, 0.0, [], list(ts)
         for n in range(9):
             u = 1.0 - v
             x = x + u * 0.125 / T
