@@ -1,5 +1,7 @@
 """A compiled system as a problem with events."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,8 @@ from ...base.tolerances import CONSISTENT, RESOLUTION
 from ...compile.lowering.plan_events import EventPlan
 from ...solve.adjoint.resting import still
 from ...solve.events.facts import EventFacts
-from ...solve.events.problem import AbstractHybridProblem
+from ...solve.events.past import Past, begin_due
+from ...solve.events.problem import AbstractHybridProblem, HybridState
 from ...solve.methods.switching import Watch
 from ...write.events import EventFlag
 from ..start.after_event import with_blocks_solved
@@ -34,6 +37,7 @@ class SystemProblem(AbstractHybridProblem):
     resolution: Time
     implicit: bool = eqx.field(static=True)
     facts: EventFacts = eqx.field(static=True)
+    ticks: Array | None = None  # when the breaks come out of delays that do so now
 
     @property
     def events(self) -> EventPlan:
@@ -57,7 +61,43 @@ class SystemProblem(AbstractHybridProblem):
         return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
     def at_instant(self, args):
-        return (from_then_on(args, self.resolution), any_held(args)) if args else (args, False)
+        problem, past = self, self.system.past
+        if past is not None:
+            problem = self.remembering(past.past.onwards(self.resolution), self.ticks)
+        then, may_jump = (from_then_on(args, self.resolution), any_held(args)) if args else (args, False)
+        return problem, then, may_jump or past is not None
+
+    def remembering(self, past, ticks=None):
+        return dataclasses.replace(self, system=dataclasses.replace(self.system, past=past), ticks=ticks)
+
+    def due(self, ticks):
+        due = super().due(ticks)
+        if self.ticks is None or self.facts.delays is None:
+            return due
+        return due.at[np.array(self.facts.delays.clocks)].set(self.ticks)
+
+    def sources(self, t, x, q, args):
+        values, instants = self.system.holding(q).at(t, args).delayed(x)
+        return values, instants
+
+    def longest(self):
+        system = self.system
+        return SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes).longest_delays()
+
+    def with_past_read(self, t, x, q, args):
+        delays = self.system.plan.delays
+        if delays is None:
+            return q
+        return q.at[delays.table.read].set(self.system.holding(q).at(t, args).past_read(x))
+
+    def with_past(self, t0: Time, y0: HybridState, args: Args, room: int) -> HybridState:
+        """The state in which a run begins, with room for so many steps within the longest delay."""
+        delays = self.facts.delays
+        if delays is None:
+            return y0
+        first, instants = self.sources(t0, y0.x, y0.q, args)
+        past = Past.begin(t0, first, t0 - instants, room)
+        return y0.but(past=past, due=begin_due(delays, past, t0, t0 - instants, y0.due))
 
     def written(self, t, x, read, q, previous, events, args):
         plan = self.events

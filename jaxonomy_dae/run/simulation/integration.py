@@ -58,6 +58,7 @@ class Options(eqx.Module):
     max_events: int = eqx.field(static=True, default=0)
     room: int = eqx.field(static=True, default=0)  # for so many events in the log
     save_events: bool = eqx.field(static=True, default=False)
+    remembered: int = eqx.field(static=True, default=0)  # so many steps within the longest delay
 
 
 class Outcome(eqx.Module):
@@ -166,11 +167,14 @@ def run(
         discrete = jnp.where((rows.filled & consistent)[:, None], discrete, jnp.nan)
     end: HybridState = done.last[1]
     with_events = parts.problem is not None
+    held = end.q if with_events else None
+    if isinstance(fn, _WithPast):
+        held = fn.held(done.last[0], end, given.inputs)
     return Outcome(
         found=begin.found._replace(jacobian=None), ts=rows.ts, x=x, last=rows.last, stats=done.stats,
         result=_result(given, parts, done.result, rows, consistent),
         is_stiff=consistent & (done.result == STIFF) if watch is not None else jnp.array(False), discrete=discrete,
-        events=EventLog.of(end) if with_events else None, held=end.q if with_events else None, memory=rows.memory,
+        events=EventLog.of(end) if with_events else None, held=held, memory=rows.memory,
     )  # fmt: skip
 
 
@@ -225,10 +229,11 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
     resumed, q0 = begin.resumed, system.discrete_values
     q0 = q0 if resumed is None else without_clocked(system, q0)
     y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
+    y0 = problem.with_past(t0, y0, inputs, options.remembered)
     clashes = y0.stuck < -1
     return _Parts(
         term=HybridTerm(problem), solver=WithEvents(chosen, options.max_events, options.room, options.save_events),
-        controller=ending(controller, AtEvents()), dt0=dt0, problem=problem, y0=y0, saved=_with_events,
+        controller=ending(controller, AtEvents()), dt0=dt0, problem=problem, y0=y0, saved=_with_events if system.plan.delays is None else _WithPast(problem),
         admitted=admitted, consistent=consistent, goes_on=admitted & (y0.ended == 0) & ~clashes, clashes=clashes,
     )  # fmt: skip
 
@@ -300,3 +305,17 @@ def _whole(t: Time, y: State, args: Args) -> State:
 
 def _with_events(t: Time, y: HybridState, args: Args) -> State:
     return y.x, y.q, jax.lax.stop_gradient(jnp.concatenate([y.armed, y.ticks]))
+
+
+class _WithPast(eqx.Module):
+    """What is saved of a state with a past: discrete values have what equations read of it."""
+
+    problem: SystemProblem
+
+    def __call__(self, t: Time, y: HybridState, args: Args) -> State:
+        return _with_events(t, y.but(q=self.held(t, y, args)), args)
+
+    def held(self, t: Time, y: HybridState, args: Args) -> Array:
+        """The discrete values at a time."""
+        problem = self.problem.remembering(y.past.onwards(self.problem.resolution))
+        return problem.with_past_read(t, y.x, y.q, args)

@@ -47,6 +47,7 @@ from .step_sizes import clipped, controller_for, scaled_atol
 
 FEW_NUMBERS = 20_000  # on one side of all events: up to so many, states before and after events are kept (160 kB)
 ROOM = 100  # events that the log of a first run has room for; a run with more is made again with room for all
+REMEMBERED = 1024  # steps within the longest delay for which there is room
 MOST_EVENTS = 2**7 * ROOM  # of a run, if the user does not say: with a few steps each, near the default max_steps
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
 
@@ -303,6 +304,7 @@ class _Call:
             solver=solver, adjoint=adjoint, controller=clipped(steps, asked.jump_ts, self.ends),
             max_steps=asked.max_steps + self.ends.count, progress=self.progress, max_events=self.bounds[1], room=room,
             save_events=few and self.known if self.save_events is None else self.save_events,
+            remembered=0 if system.plan.delays is None else min(REMEMBERED, asked.max_steps) + 1,
         )  # fmt: skip
 
     def watch(self, traced: bool) -> Watch | None:

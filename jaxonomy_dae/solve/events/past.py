@@ -1,0 +1,230 @@
+"""The past of a run: what is delayed, recorded step by step and read where it comes out of the delay.
+
+A step leaves one piece: of each source the polynomial through its values at NODES places of the step, along the dense
+output of the solver. Steps are not longer than the delays, so that they read pieces that are complete.
+
+Where a source jumps or has a kink, a piece begins with its *level*: the order of the derivative that jumps. At the time
+at which such a break comes out of a delay, a step ends and an event happens. The solution is smoother than what drives it
+by one derivative (Bellen & Zennaro 2003, Numerical Methods for Delay Differential Equations, section 2.2), so that what
+comes of the break has the next level, unless the source follows what is delayed without an integration between.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from ...base.aliases import Args, Numeric, State, Time
+from ..adjoint.closure_conversion import any_member
+from ..adjoint.resting import still
+from .facts import DelayFacts
+from .problem import AbstractHybridProblem, HybridState
+
+NODES = 6  # dense output is of degree 4 or 5, and where a source is linear in the state, so is the piece
+# Breaks of a higher level are passed over: a step of a method of order five, as all here, does not see them.
+HIGHEST = 5.0
+SMOOTH = 99.0  # the level of a piece that begins without a break
+SIDE = 4.0  # times the resolution: nearer to a break, a step reads the piece that belongs to its inside
+SHORTER = 0.9  # of the shortest delay: the length of a step that is taken again, for it would have read what it makes
+LEAST = 0.25  # of its length: by no more it is shortened at once
+SEARCH = 60  # halvings, to rounding
+
+_PLACES = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # of Chebyshev and Lobatto, in [−1, 1]
+_COEFFICIENTS = np.linalg.inv(np.vander(_PLACES, increasing=True))
+_POWERS = np.arange(NODES)
+
+
+class Past(eqx.Module):
+    """The pieces of the last steps, in a ring.
+
+    - `pieces`: a row for each: start, end, levels (delays), coefficients (NODES·delays) in powers of a place in
+        [−1, 1]. A start moves with the break that it is, while the polynomial belongs to the step as it was taken.
+    - `now`: the number of pieces so far, the time at which the next one begins, that at which its step must end at the
+        latest, its levels, and what sources were at the initial time.
+    """
+
+    pieces: Float[Array, "room row"]
+    now: Float[Array, " numbers"]
+
+    @classmethod
+    def begin(cls, t0: Time, first: Float[Array, " delays"], delay: Float[Array, " delays"], room: int) -> "Past":
+        """No past but what the sources are at the initial time, where they begin to move."""
+        n = len(first)
+        pieces = jnp.zeros((room, 2 + n + NODES * n), first.dtype).at[:, :2].set(jnp.inf)
+        until = lax.stop_gradient(t0 + jnp.min(delay))
+        return cls(pieces, jnp.concatenate([jnp.stack([jnp.zeros_like(t0), t0, until]), jnp.ones(n), first]))
+
+    @property
+    def n(self) -> int:
+        """How many sources there are."""
+        return (self.now.shape[-1] - 3) // 2
+
+    count = property(lambda self: self.now[..., 0])
+    begun = property(lambda self: self.now[..., 1])
+    until = property(lambda self: self.now[..., 2])
+    levels = property(lambda self: self.now[..., 3 : 3 + self.n])
+    first = property(lambda self: self.now[..., 3 + self.n :])
+
+    def between(self, t0: Time, t1: Time, resolution: Time) -> "Remembered":
+        """The past as the step from t0 to t1 reads it."""
+        middle, side = 0.5 * (t0 + t1), SIDE * resolution
+        low, high = jnp.minimum(t0 + side, middle), jnp.maximum(t1 - side, middle)
+        return Remembered(self, *still((low, high)), jnp.zeros_like(t0))
+
+    def onwards(self, resolution: Time) -> "Remembered":
+        """The past as it is read at an instant and from then on."""
+        endless = jnp.full_like(self.begun, jnp.inf)
+        return Remembered(self, -endless, endless, SIDE * jnp.asarray(resolution, endless.dtype))
+
+
+class Remembered(eqx.Module):
+    """The past on one side of its breaks: pieces are chosen by times moved into [low, high], and `ahead`."""
+
+    past: Past
+    low: Time
+    high: Time
+    ahead: Time
+
+    def read(self, t: Time, instant: Float[Array, " delays"]) -> tuple[Array, Array]:
+        """Returns (what the sources were, their rates) at one instant for each, at the time t; constant under
+        derivatives by `t` and `instant`."""
+        past, n = self.past, self.past.n
+        t, instant, moves = still((t, instant, (self.low, self.high, self.ahead)))
+        low, high, ahead = moves
+        at = instant + (jnp.clip(t, low, high) - t) + ahead
+        starts = lax.stop_gradient(past.pieces[:, 0])
+        number = jnp.sum(starts[:, None] <= at, axis=0)
+        oldest = jnp.maximum(past.count.astype(int) - len(starts), 0)
+        # Of rows that are read each source needs its own columns alone.
+        rows = past.pieces[(oldest + jnp.maximum(number - 1, 0)) % len(starts)]
+        own = rows[:, 2 + n :].reshape(n, NODES, n)[np.arange(n), :, np.arange(n)]
+        begins, there = number == 0, jnp.where(number[:, None] > 0, lax.stop_gradient(rows[:, :2]), jnp.array([0.0, 1.0]))
+        half = 0.5 * (there[:, 1] - there[:, 0])
+        place = (instant - there[:, 0]) / half - 1.0
+        powers = place[:, None] ** _POWERS
+        value = jnp.sum(own * powers, axis=1)
+        rate = jnp.sum(own[:, 1:] * _POWERS[1:] * powers[:, :-1], axis=1) / half
+        return jnp.where(begins, past.first, value), jnp.where(begins, 0.0, rate)
+
+
+class Reached(NamedTuple):
+    """What a step meets that comes out of the delays.
+
+    - `due`: the delays out of which a break comes at the end of the step; `ticks`: when it does, which moves with
+        parameters; `level`: the levels of these breaks; shape (delays,) each.
+    - `request`: the end of the shorter step to take instead; infinity to keep this one.
+    - `vanishes`: a delay is shorter than any step.
+    - `row`: the piece that the step leaves; `instants`: the times at which the past is read at its end.
+    """
+
+    due: Bool[Array, " delays"]
+    ticks: Array
+    level: Array
+    request: Time
+    vanishes: Array
+    row: Array
+    instants: Array
+
+
+def reached(
+    problem: AbstractHybridProblem, dense: Any, t0: Time, t1: Time, y0: HybridState, x1: State, args: Args,
+    jumped: Numeric,
+) -> Reached:  # fmt: skip
+    """Looks at the step from y0 to x1, whose states are `dense(t0, t1, t)`; `jumped` says whether inputs jump where it
+    begins."""
+    past, tolerance, h = y0.past, problem.resolution, t1 - t0
+    inside = t0 + h * jnp.asarray(0.5 * (1 + _PLACES[1:-1]), t1.dtype)
+    times = jnp.concatenate([t0[None], inside, t1[None]])
+    states = jnp.concatenate([y0.x[None], jax.vmap(lambda t: dense(t0, t1, t))(inside), x1[None]])
+    values, instants = jax.vmap(lambda t, x: problem.sources(t, x, y0.q, args))(times, states)
+    levels = jnp.where(jumped, jnp.zeros_like(past.levels), past.levels)
+    start = t0 + (past.begun - lax.stop_gradient(past.begun))
+    fitted = jnp.asarray(_COEFFICIENTS, values.dtype)
+    row = jnp.concatenate([jnp.stack([start, t1]), levels, (fitted @ values).ravel()])
+
+    now = lax.stop_gradient(instants)
+    starts, all_levels = jnp.append(past.pieces[:, 0], start), jnp.append(past.pieces[:, 2 : 2 + past.n], levels[None], 0)
+    which, left = _next(starts, all_levels, now[0] + 2 * tolerance)
+    breaks, level = starts[which], all_levels[which, np.arange(past.n)]
+    slopes = fitted @ now
+    rate = slopes.T @ jnp.asarray(_POWERS, now.dtype) * (2 / h)
+    passed = left & (now[-1] > breaks + tolerance)
+    due = left & ~passed & (now[-1] >= breaks - tolerance)
+    ticks = t1 + jnp.where(due, (breaks - instants[-1]) / jnp.where(due & (rate != 0), rate, 1.0), 0.0)
+
+    def located() -> Time:
+        place = _crossing(slopes, lax.stop_gradient(breaks))
+        return jnp.min(jnp.where(passed, t0 + 0.5 * h * (1 + place), jnp.inf))
+
+    where = lax.cond(any_member(jnp.any(passed)), located, lambda: jnp.full_like(t1, jnp.inf))
+    where = jnp.where(jnp.isfinite(where), jnp.maximum(where, t0 + 2 * tolerance), where)
+    shortest = jnp.min(times[:, None] - now)
+    far = jnp.max(now) > t0 + tolerance
+    sooner = jnp.where(far, t0 + jnp.maximum(SHORTER * shortest, LEAST * h), jnp.inf)
+    vanishes = far & (h <= 16 * tolerance)
+    request = jnp.where(vanishes, jnp.inf, jnp.minimum(where, sooner))
+    return Reached(due & ~jnp.isfinite(request), ticks, level, still(request), vanishes, row, now[-1])
+
+
+def begin_due(facts: DelayFacts, past: Past, t0: Time, delay: Array, due: Array) -> Array:
+    """When each clock is due at the beginning of a run, those of the delays included."""
+    ends = jnp.where(np.array(facts.constant), t0 + delay, jnp.inf)
+    return due.at[np.array(facts.clocks)].set(still(ends))
+
+
+def after(
+    facts: DelayFacts, t1: Time, before: HybridState, y1: HybridState, reach: Reached, time: Time, others: Numeric,
+    tolerance: Time,
+) -> HybridState:  # fmt: skip
+    """The state `y1` after a step from `before` with the piece that it leaves, and with the times at which the next
+    breaks come out. `time` is that of the events at its end, `others` says whether there were any but those of
+    delays."""
+    past = before.past
+    # Of several that come out at once the lowest level counts.
+    passes = np.array(facts.passes)
+    own = jnp.where(passes, reach.level, reach.level + 1.0)
+    levels = jnp.min(jnp.where(reach.due, own, SMOOTH), axis=1)
+    levels = still(jnp.where(others, jnp.zeros_like(levels), levels)).astype(t1.dtype)
+    place = past.count.astype(int) % len(past.pieces)
+    pieces = past.pieces.at[place].set(reach.row)
+    delay = t1 - reach.instants
+    head = jnp.stack([past.count + 1, time, still(t1 + jnp.min(delay))])
+    new = Past(pieces, jnp.concatenate([head, levels, past.first]))
+    starts, all_levels = jnp.append(pieces[:, 0], t1), jnp.append(pieces[:, 2 : 2 + past.n], levels[None], 0)
+    which, left = _next(starts, all_levels, reach.instants + 2 * tolerance)
+    due = jnp.where(left & np.array(facts.constant), t1 + (starts[which] - reach.instants), jnp.inf)
+    return y1.but(past=new, due=y1.due.at[np.array(facts.clocks)].set(still(due)))
+
+
+def is_full(past: Past, t: Time, longest: Array) -> Bool[Array, ""]:
+    """True if the piece that is written over next is still needed."""
+    oldest = past.pieces[past.count.astype(int) % len(past.pieces)]
+    return (past.count >= len(past.pieces)) & (oldest[1] > t - jnp.max(longest))
+
+
+def _next(starts: Array, levels: Array, since: Array) -> tuple[Array, Array]:
+    """Returns (the number of the first break of each source since an instant, whether there is one)."""
+    counts = (levels <= HIGHEST) & (starts[:, None] > since)
+    times = lax.stop_gradient(jnp.where(counts, starts[:, None], jnp.inf))
+    which = jnp.argmin(times, axis=0)
+    return which, jnp.isfinite(jnp.min(times, axis=0))
+
+
+def _crossing(coefficients: Array, levels: Array) -> Array:
+    """Where in [−1, 1] polynomials pass these levels, shape (delays,)."""
+
+    def value(place: Array) -> Array:
+        return jnp.sum(coefficients * place ** _POWERS[:, None], axis=0)
+
+    def halved(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        beyond = value(middle) > levels
+        return jnp.where(beyond, low, middle), jnp.where(beyond, middle, high)
+
+    one = jnp.ones_like(levels)
+    return lax.fori_loop(0, SEARCH, halved, (-one, one))[1]
