@@ -66,8 +66,8 @@ class DelayDeclarations:
 
         A run records the expression at six places of each step, along the dense output of the solver, and reads the
         polynomial through them. Steps are not longer than the delay. They end where a jump, a kink or the beginning of
-        the record comes out of the delay, until five integrations have smoothed it. Derivatives by parameters, the delay
-        among them, pass through the record.
+        the record comes out of the delay, until five integrations have smoothed it. Derivatives by parameters, the
+        delay among them, pass through the record.
 
         **Arguments:**
 

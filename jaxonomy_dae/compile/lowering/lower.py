@@ -65,9 +65,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
     held = plan_held(flat.held, variable_map, lambda q: program(needed(steps, q, n)))
     delays = None
     if events is not None and len(flat.delays):
-        delays = plan_delays(
-            flat, events.table, variable_map, extended, steps, lambda q: program(needed(steps, q, n))
-        )
+        delays = plan_delays(flat, events.table, variable_map, extended, steps, lambda q: program(needed(steps, q, n)))
         assert delays is not None
         events = dataclasses.replace(events, facts=dataclasses.replace(events.facts, delays=delays.facts))
     watched = [] if events is None else [variable_map.quantity[events.table.guard[events.n_clocks :]]]

@@ -148,6 +148,11 @@ class SystemPlan:
         assert self.events is not None
         return self.events
 
+    def refuse_delays(self, why: str) -> None:
+        """Raises a `ModelError` if something is delayed."""
+        if self.delays is not None:
+            raise ModelError(f"'{self.delays.table.text[0]}' is delayed, and {why}")
+
     @property
     def flat(self) -> FlatModel:
         """The model as flattened."""

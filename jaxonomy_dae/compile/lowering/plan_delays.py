@@ -60,8 +60,8 @@ def plan_delays(
         twice = np.flatnonzero(np.isin(parameters[:, 2], group.parameter)) if group.level > 1 else ()
         if len(twice):
             raise ModelError(
-                f"'{table.text[twice[0]]}': the equations need its second derivative, because it drives a constraint on "
-                "positions or the like, and a record of the past has rates only. Let it drive a force or a speed"
+                f"'{table.text[twice[0]]}': the equations need its second derivative, because it drives a constraint "
+                "on positions or the like, and a record of the past has rates only. Let it drive a force or a speed"
             )
     behind = Behind(steps, extended.quantities.n)
     read = [behind.parameters(int(variables.quantity[v])) for v in table.source]

@@ -49,7 +49,9 @@ def event_table(model: ModelNumbers) -> EventTable:
 
     def event(k: int, i: Instances, row: int, when: When) -> Event:
         clock = when.clock
-        period = None if clock is None or clock.period is None else in_parameters(model, parameter, i, row, clock.period)
+        period = (
+            None if clock is None or clock.period is None else in_parameters(model, parameter, i, row, clock.period)
+        )
         return Event(
             owner=model.paths[k],
             condition=when.text,

@@ -208,7 +208,9 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
     system, t0, t1, inputs, controller = begin.system, given.t0, given.t1, given.inputs, options.controller
     x0, admitted, consistent = begin.found.x, begin.admitted, is_consistent(begin.found)
     implicit, prescribed = is_implicit(options.solver), isinstance(controller, diffrax.StepTo)
-    chosen = options.solver if given.ts is None else right_between_steps(options.solver)
+    # What is delayed is recorded along the dense output, too.
+    ends_count = given.ts is None and system.plan.delays is None
+    chosen = options.solver if ends_count else right_between_steps(options.solver)
     tolerance = largest_tolerance(system, controller)
     solver = prepared(system, chosen, implicit, watch, tolerance, judged=not prescribed)
     term = term_of(system, implicit)
@@ -230,10 +232,11 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
     q0 = q0 if resumed is None else without_clocked(system, q0)
     y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
     y0 = problem.with_past(t0, y0, inputs, options.remembered)
+    saved = _with_events if system.plan.delays is None else _WithPast(problem)
     clashes = y0.stuck < -1
     return _Parts(
         term=HybridTerm(problem), solver=WithEvents(chosen, options.max_events, options.room, options.save_events),
-        controller=ending(controller, AtEvents()), dt0=dt0, problem=problem, y0=y0, saved=_with_events if system.plan.delays is None else _WithPast(problem),
+        controller=ending(controller, AtEvents()), dt0=dt0, problem=problem, y0=y0, saved=saved,
         admitted=admitted, consistent=consistent, goes_on=admitted & (y0.ended == 0) & ~clashes, clashes=clashes,
     )  # fmt: skip
 

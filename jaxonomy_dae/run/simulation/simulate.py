@@ -20,6 +20,7 @@ from ...host.members import batch_size, is_batched, say_of_members
 from ...host.rows import filled_up
 from ...host.staging import as_argument, as_array, is_staged, is_traced, on_device, picked
 from ...solve.adjoint.stored_adjoint import default_adjoint
+from ...solve.events.solver import FORGETS
 from ...solve.methods import BDF, Rodas5P, Tsit5
 from ...solve.methods.causes import decay_at, is_stiff
 from ...solve.methods.drive import is_implicit
@@ -249,6 +250,7 @@ class _Call:
     """A call of `simulate`: what is integrated, the solver chosen, and the options as they were checked.
 
     - `begun`: what is known of the start; `known`: whether nothing is traced; `duration`: of the run, None if traced.
+    - `remembered`: so many steps within the longest delay have room.
     """
 
     system: AcausalSystem
@@ -269,6 +271,7 @@ class _Call:
     known: bool
     duration: float | None
     asked: Asked
+    remembered: int = REMEMBERED
 
     @property
     def bounds(self) -> tuple[int, int]:
@@ -304,7 +307,7 @@ class _Call:
             solver=solver, adjoint=adjoint, controller=clipped(steps, asked.jump_ts, self.ends),
             max_steps=asked.max_steps + self.ends.count, progress=self.progress, max_events=self.bounds[1], room=room,
             save_events=few and self.known if self.save_events is None else self.save_events,
-            remembered=0 if system.plan.delays is None else min(REMEMBERED, asked.max_steps) + 1,
+            remembered=0 if system.plan.delays is None else min(self.remembered, asked.max_steps) + 1,
         )  # fmt: skip
 
     def watch(self, traced: bool) -> Watch | None:
@@ -376,6 +379,10 @@ class _Call:
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": t}
             outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
             counts = outcome.numbers() | before
+        while is_code(outcome.result, FORGETS) and call.remembered < self.asked.max_steps:
+            call = dataclasses.replace(call, remembered=4 * call.remembered)
+            outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
+            counts = outcome.numbers()
         if outcome.events is not None and self.max_events is None and float(outcome.events.count) > room:
             room = _room_for(float(outcome.events.count))
             outcome = run_compiled(rows, call.options(room), None, begun=call.begun)

@@ -22,8 +22,8 @@ from ...compile.model.typical_sizes import typical_sizes
 from ...host.cache import compiled
 from ...host.platform import precisely
 from ...host.staging import is_staged, is_traced, joined, on_device, picked
-from ...solve.linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ...solve.events.past import Remembered
+from ...solve.linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from .input_values import check_given
 from .inputs import check_range, read_inputs
 from .nonlinear import Refinement

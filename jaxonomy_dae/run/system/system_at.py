@@ -266,7 +266,13 @@ class SystemAt:
         inputs = input_values(self.plan, self.inputs, self.t, self.dtype)
         networks = Networks(self.networks)
         return Measured(
-            self._chunk(x), self._chunk(sizes), inputs, self._with_past(x, inputs, self.t), self.t, networks, self.typical
+            self._chunk(x),
+            self._chunk(sizes),
+            inputs,
+            self._with_past(x, inputs, self.t),
+            self.t,
+            networks,
+            self.typical,
         ).run(program, Refinement.NONE)
 
     @traced_once

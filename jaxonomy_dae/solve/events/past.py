@@ -4,8 +4,8 @@ A step leaves one piece: of each source the polynomial through its values at NOD
 output of the solver. Steps are not longer than the delays, so that they read pieces that are complete.
 
 Where a source jumps or has a kink, a piece begins with its *level*: the order of the derivative that jumps. At the time
-at which such a break comes out of a delay, a step ends and an event happens. The solution is smoother than what drives it
-by one derivative (Bellen & Zennaro 2003, Numerical Methods for Delay Differential Equations, section 2.2), so that what
+at which such a break comes out of a delay, a step ends and an event happens. The solution is smoother than what drives
+it by one derivative (Bellen & Zennaro 2003, Numerical Methods for Delay Differential Equations, section 2.2), so that what
 comes of the break has the next level, unless the source follows what is delayed without an integration between.
 """
 
@@ -102,7 +102,10 @@ class Remembered(eqx.Module):
         # Of rows that are read each source needs its own columns alone.
         rows = past.pieces[(oldest + jnp.maximum(number - 1, 0)) % len(starts)]
         own = rows[:, 2 + n :].reshape(n, NODES, n)[np.arange(n), :, np.arange(n)]
-        begins, there = number == 0, jnp.where(number[:, None] > 0, lax.stop_gradient(rows[:, :2]), jnp.array([0.0, 1.0]))
+        begins, there = (
+            number == 0,
+            jnp.where(number[:, None] > 0, lax.stop_gradient(rows[:, :2]), jnp.array([0.0, 1.0])),
+        )
         half = 0.5 * (there[:, 1] - there[:, 0])
         place = (instant - there[:, 0]) / half - 1.0
         powers = place[:, None] ** _POWERS
@@ -144,20 +147,23 @@ def reached(
     levels = jnp.where(jumped, jnp.zeros_like(past.levels), past.levels)
     start = t0 + (past.begun - lax.stop_gradient(past.begun))
     fitted = jnp.asarray(_COEFFICIENTS, values.dtype)
-    row = jnp.concatenate([jnp.stack([start, t1]), levels, (fitted @ values).ravel()])
+    # Differences are fitted: what is constant, such as a whole number, comes out as it is.
+    polynomials = (fitted @ (values - values[0])).at[0].add(values[0])
+    row = jnp.concatenate([jnp.stack([start, t1]), levels, polynomials.ravel()])
 
     now = lax.stop_gradient(instants)
-    starts, all_levels = jnp.append(past.pieces[:, 0], start), jnp.append(past.pieces[:, 2 : 2 + past.n], levels[None], 0)
+    starts, all_levels = (
+        jnp.append(past.pieces[:, 0], start),
+        jnp.append(past.pieces[:, 2 : 2 + past.n], levels[None], 0),
+    )
     which, left = _next(starts, all_levels, now[0] + 2 * tolerance)
     breaks, level = starts[which], all_levels[which, np.arange(past.n)]
-    slopes = fitted @ now
-    rate = slopes.T @ jnp.asarray(_POWERS, now.dtype) * (2 / h)
     passed = left & (now[-1] > breaks + tolerance)
     due = left & ~passed & (now[-1] >= breaks - tolerance)
-    ticks = t1 + jnp.where(due, (breaks - instants[-1]) / jnp.where(due & (rate != 0), rate, 1.0), 0.0)
+    ticks = t1 + jnp.where(due, (breaks - instants[-1]) / _rates(problem, t1, x1, y0.q, args, due), 0.0)
 
     def located() -> Time:
-        place = _crossing(slopes, lax.stop_gradient(breaks))
+        place = _crossing(fitted @ now, lax.stop_gradient(breaks))
         return jnp.min(jnp.where(passed, t0 + 0.5 * h * (1 + place), jnp.inf))
 
     where = lax.cond(any_member(jnp.any(passed)), located, lambda: jnp.full_like(t1, jnp.inf))
@@ -168,6 +174,26 @@ def reached(
     vanishes = far & (h <= 16 * tolerance)
     request = jnp.where(vanishes, jnp.inf, jnp.minimum(where, sooner))
     return Reached(due & ~jnp.isfinite(request), ticks, level, still(request), vanishes, row, now[-1])
+
+
+def _rates(problem: AbstractHybridProblem, t: Time, x: State, q: Array, args: Args, due: Array) -> Array:
+    """How fast the times at which the past is read go on, not zero; 1 for those at which nothing is due."""
+    one, constant = jnp.ones_like(due, t.dtype), np.array(_facts(problem).constant)
+    if constant.all():
+        return one
+    problem, t, x, q, args = still((problem, t, x, q, args))
+
+    def along() -> Array:
+        direction = jnp.ones_like(t), problem.slope(t, x, q, args)
+        return jax.jvp(lambda t, x: problem.sources(t, x, q, args)[1], (t, x), direction)[1]
+
+    rate = lax.cond(any_member(jnp.any(due & ~constant)), along, lambda: one)
+    return jnp.where(due & ~constant & (rate != 0), rate, 1.0)
+
+
+def _facts(problem: AbstractHybridProblem) -> DelayFacts:
+    assert problem.facts.delays is not None
+    return problem.facts.delays
 
 
 def begin_due(facts: DelayFacts, past: Past, t0: Time, delay: Array, due: Array) -> Array:
