@@ -442,7 +442,7 @@ class Scope:
     def _delay(self, e: Expression, time: Expression, longest: Expression | None = None) -> Value:
         by = self.evaluate(time)
         # With a delay that is constant, the specification asks for no limit, and one that is given says nothing more.
-        changes = isinstance(by, sympy.Basic) and not _is_of_parameters(by)
+        changes = isinstance(by, sympy.Expr) and not _is_of_parameters(by)
         if changes and longest is None:
             raise ModelError(f"delay(…) with the delay {by}, which changes, needs a third argument, the longest delay")
         limit = self.evaluate(longest) if changes and longest is not None else None
@@ -455,7 +455,7 @@ class Scope:
         value = as_number(value)
         if isinstance(time, int | float) and time == 0:
             return value
-        if not isinstance(value, sympy.Basic) or (_is_of_parameters(value) and not value.has(TimeSymbol)):
+        if not isinstance(value, sympy.Expr) or (_is_of_parameters(value) and not value.has(TimeSymbol)):
             return value
         key = value, time, longest
         if key not in self.delays:

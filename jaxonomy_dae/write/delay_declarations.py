@@ -7,7 +7,7 @@ import sympy
 
 from ..base.errors import ModelError
 from .declarations import Value
-from .environment import EqnEnv
+from .discrete_declarations import DiscreteDeclarations
 from .events import NO_FLAG, Assign, Sampled, When
 from .real_number import real_number
 from .symbols import DiscreteSymbol, EarlierSymbol, ParameterSymbol, PreviousSymbol, VariableSymbol, der
@@ -37,21 +37,13 @@ class Delay:
     is_constant: bool
 
 
-class DelayDeclarations:
+class DelayDeclarations(DiscreteDeclarations):
     """The part of `Component` that concerns delayed quantities."""
 
     # Attributes and methods of the other parts of `Component`.
-    ev: EqnEnv
-    name: str
-    events: list[When]
-    equations: list[sympy.Expr]
     delays: list[Delay]
-    add_equations: Callable[..., None]
     initially: Callable[..., None]
     _claim: Callable[[str, str], None]
-    _declare: Callable[..., VariableSymbol]
-    _unshown: Callable[[str, float], DiscreteSymbol]
-    _check_parameters_only: Callable[[sympy.Expr, str], None]
 
     def delayed(
         self, name: str, expression: Value, time: Value, longest: Value | None = None, unit: str = ""
@@ -114,8 +106,12 @@ class DelayDeclarations:
         # Where a break of the past comes out of the delay, the run has an event. Its times are found while running.
         over = When(f"delayed {name}", None, Sampled(None, NEVER), (Assign(begins, sympy.S.Zero),), (0.0,), NO_FLAG)
         self.events.append(over)
-        names = (s.path for s in (late, source, instant, begins, base, value, rate))
-        self.delays.append(Delay(*names, limit, longest is None))
+        self.delays.append(
+            Delay(
+                late.path, source.path, instant.path, begins.path, base.path, value.path, rate.path, limit,
+                is_constant=longest is None,
+            )
+        )  # fmt: skip
         return late
 
 

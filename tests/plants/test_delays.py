@@ -32,7 +32,7 @@ class Decay(Component):
 
 def decayed(t, a=-1.0, T=1.0):
     """x by the method of steps: a polynomial in each interval of length T."""
-    return sum(a**k * jnp.maximum(t - (k - 1) * T, 0.0) ** k / math.factorial(k) for k in range(25))
+    return sum(a**k * jnp.maximum(t - (k - 1) * T, 0.0) ** k / float(math.factorial(k)) for k in range(25))
 
 
 class Line(Component):
@@ -209,7 +209,7 @@ def test_what_is_refused():
     with pytest.raises(ModelError, match="'m.late' must be positive; it is -1 s"):
         simulate(system.with_parameters({"m.T": -1.0}), 1.0)
     with pytest.raises(ModelError, match="a delay has no state space of finite size"):
-        linearize(system, outputs=["m.x"])
+        linearize(system, [], ["m.x"])
     with pytest.raises(ModelError, match="equilibria of models with delays"):
         steady_state(system)
 

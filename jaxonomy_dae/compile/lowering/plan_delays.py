@@ -57,8 +57,8 @@ def plan_delays(
     parameters = flat.parameters.discrete[table.read]
     values = parameters[:, 2].tolist()
     for group in extended.groups:
-        twice = np.flatnonzero(np.isin(parameters[:, 2], group.parameter)) if group.level > 1 else ()
-        if len(twice):
+        twice = np.flatnonzero(np.isin(parameters[:, 2], group.parameter))
+        if group.level > 1 and len(twice):
             raise ModelError(
                 f"'{table.text[twice[0]]}': the equations need its second derivative, because it drives a constraint "
                 "on positions or the like, and a record of the past has rates only. Let it drive a force or a speed"

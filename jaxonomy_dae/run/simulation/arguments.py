@@ -160,12 +160,13 @@ def _check_delays(system: AcausalSystem, initial: PyTree) -> None:
     known = eqx.tree_at(lambda s: s.parameters, system, still(system.parameters))
     point = SystemAt(system.plan, known.numbers, (), 0.0, {}, system.typical_sizes)
     longest = _concrete(point.longest_delays())
-    bad = np.flatnonzero(~(longest > 0)) if longest is not None else ()
-    if len(bad):
-        raise ModelError(
-            f"the delay of '{delays.table.text[bad[0]]}' must be positive; it is {longest[bad[0]]:g} s. Set it with "
-            "with_parameters"
-        )
+    if longest is None or (longest > 0).all():
+        return
+    bad = int(np.flatnonzero(~(longest > 0))[0])
+    raise ModelError(
+        f"the delay of '{delays.table.text[bad]}' must be positive; it is {longest[bad]:g} s. Set it with "
+        "with_parameters"
+    )
 
 
 def _concrete(value: object) -> np.ndarray | None:

@@ -38,6 +38,7 @@ class SystemProblem(AbstractHybridProblem):
     implicit: bool = eqx.field(static=True)
     facts: EventFacts = eqx.field(static=True)
     ticks: Array | None = None  # when the breaks come out of delays that do so now
+    record: tuple[Tolerance, Tolerance] | None = None  # (atol, rtol) of the record of what is delayed
 
     @property
     def events(self) -> EventPlan:
@@ -83,6 +84,13 @@ class SystemProblem(AbstractHybridProblem):
     def longest(self):
         system = self.system
         return SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes).longest_delays()
+
+    def allowed(self, size):
+        delays = self.system.plan.delays
+        assert delays is not None and self.record is not None
+        quantity = self.system.plan.variable_map.quantity[delays.table.source]
+        atol, rtol = self.record
+        return rtol * size + atol * self.system.typical_sizes[quantity]
 
     def with_past_read(self, t, x, q, args):
         delays = self.system.plan.delays
@@ -154,8 +162,9 @@ def resolution(t0: Time, t1: Time) -> Time:
 
 
 def problem_for(
-    system: AcausalSystem, t0: Time, t1: Time, implicit: bool, watch: Watch | None, tolerance: Tolerance
-) -> SystemProblem:
+    system: AcausalSystem, t0: Time, t1: Time, implicit: bool, watch: Watch | None, tolerance: Tolerance,
+    record: tuple[Tolerance, Tolerance] | None = None,
+) -> SystemProblem:  # fmt: skip
     """The problem of a system that has events, to be run from t0 to t1."""
     events = system.plan.some_events
     return SystemProblem(
@@ -165,6 +174,7 @@ def problem_for(
         resolution=resolution(t0, t1),
         implicit=implicit,
         facts=events.facts,
+        record=record,
     )
 
 

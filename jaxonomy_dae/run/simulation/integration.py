@@ -30,7 +30,7 @@ from .arguments import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .from_state import from_state
 from .hybrid_problem import SystemProblem, problem_for, without_clocked
-from .preparation import SAVED_ITERATIONS, largest_tolerance, prepared, term_of
+from .preparation import SAVED_ITERATIONS, largest_tolerance, prepared, term_of, tolerances_of_a_record
 from .saved_state import Memory, SavedState, same_time
 from .step_sizes import first_step
 
@@ -224,7 +224,8 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
         )  # fmt: skip
     # With events, the solver is prepared for the discrete values of each mode, inside the steps
     # (`SystemProblem.prepared`). So it is wrapped as it was chosen.
-    problem = problem_for(system, t0, t1, implicit, watch, tolerance)
+    record = None if system.plan.delays is None else tolerances_of_a_record(controller, tolerance)
+    problem = problem_for(system, t0, t1, implicit, watch, tolerance, record)
     if system.plan.held is not None:
         admitted = admitted & jnp.all(jnp.isfinite(problem.admitted(t0, x0, system.discrete_values, inputs)))
         consistent = consistent & admitted

@@ -48,7 +48,8 @@ from .step_sizes import clipped, controller_for, scaled_atol
 
 FEW_NUMBERS = 20_000  # on one side of all events: up to so many, states before and after events are kept (160 kB)
 ROOM = 100  # events that the log of a first run has room for; a run with more is made again with room for all
-REMEMBERED = 1024  # steps within the longest delay for which there is room
+# Steps within the longest delay for which there is room, and the most numbers that they take: each step copies these.
+REMEMBERED, MOST_REMEMBERED = 1024, 40_000
 MOST_EVENTS = 2**7 * ROOM  # of a run, if the user does not say: with a few steps each, near the default max_steps
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
 
@@ -250,7 +251,6 @@ class _Call:
     """A call of `simulate`: what is integrated, the solver chosen, and the options as they were checked.
 
     - `begun`: what is known of the start; `known`: whether nothing is traced; `duration`: of the run, None if traced.
-    - `remembered`: so many steps within the longest delay have room.
     """
 
     system: AcausalSystem
@@ -271,12 +271,21 @@ class _Call:
     known: bool
     duration: float | None
     asked: Asked
-    remembered: int = REMEMBERED
+    more: int = 1  # times the room for what is delayed
 
     @property
     def bounds(self) -> tuple[int, int]:
         """The largest numbers of steps and of events."""
         return self.asked.max_steps, MOST_EVENTS if self.max_events is None else self.max_events
+
+    @property
+    def remembered(self) -> int:
+        """For so many steps within the longest delay there is room."""
+        delays = self.system.plan.delays
+        if delays is None:
+            return 0
+        room = min(REMEMBERED, max(MOST_REMEMBERED // (9 * len(delays)), 64))
+        return min(self.more * room, self.asked.max_steps) + 1
 
     @functools.cached_property
     def run_by(self) -> Solver:
@@ -307,7 +316,7 @@ class _Call:
             solver=solver, adjoint=adjoint, controller=clipped(steps, asked.jump_ts, self.ends),
             max_steps=asked.max_steps + self.ends.count, progress=self.progress, max_events=self.bounds[1], room=room,
             save_events=few and self.known if self.save_events is None else self.save_events,
-            remembered=0 if system.plan.delays is None else min(self.remembered, asked.max_steps) + 1,
+            remembered=self.remembered,
         )  # fmt: skip
 
     def watch(self, traced: bool) -> Watch | None:
@@ -379,8 +388,8 @@ class _Call:
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": t}
             outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
             counts = outcome.numbers() | before
-        while is_code(outcome.result, FORGETS) and call.remembered < self.asked.max_steps:
-            call = dataclasses.replace(call, remembered=4 * call.remembered)
+        while is_code(outcome.result, FORGETS) and call.remembered <= self.asked.max_steps:
+            call = dataclasses.replace(call, more=4 * call.more)
             outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
             counts = outcome.numbers()
         if outcome.events is not None and self.max_events is None and float(outcome.events.count) > room:

@@ -5,7 +5,7 @@ output of the solver. Steps are not longer than the delays, so that they read pi
 
 Where a source jumps or has a kink, a piece begins with its *level*: the order of the derivative that jumps. At the time
 at which such a break comes out of a delay, a step ends and an event happens. The solution is smoother than what drives
-it by one derivative (Bellen & Zennaro 2003, Numerical Methods for Delay Differential Equations, section 2.2), so that what
+it by one derivative (Bellen & Zennaro 2003, Numerical Methods for Delay Differential Equations, section 2.2). So what
 comes of the break has the next level, unless the source follows what is delayed without an integration between.
 """
 
@@ -25,6 +25,8 @@ from .facts import DelayFacts
 from .problem import AbstractHybridProblem, HybridState
 
 NODES = 6  # dense output is of degree 4 or 5, and where a source is linear in the state, so is the piece
+BETWEEN = np.array([-0.6, 0.0, 0.6])  # places at which a piece is compared with its source
+LONGEST, SAFETY = 5.0, 0.9  # how much longer than the last step the pieces allow the next one; and a part of that
 # Breaks of a higher level are passed over: a step of a method of order five, as all here, does not see them.
 HIGHEST = 5.0
 SMOOTH = 99.0  # the level of a piece that begins without a break
@@ -35,7 +37,6 @@ SEARCH = 60  # halvings, to rounding
 
 _PLACES = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # of Chebyshev and Lobatto, in [−1, 1]
 _COEFFICIENTS = np.linalg.inv(np.vander(_PLACES, increasing=True))
-_POWERS = np.arange(NODES)
 
 
 class Past(eqx.Module):
@@ -45,10 +46,12 @@ class Past(eqx.Module):
         [−1, 1]. A start moves with the break that it is, while the polynomial belongs to the step as it was taken.
     - `now`: the number of pieces so far, the time at which the next one begins, that at which its step must end at the
         latest, its levels, and what sources were at the initial time.
+    - `last`: what sources were at the end of the last piece, and 0 for those that were constant in it, else 1.
     """
 
     pieces: Float[Array, "room row"]
     now: Float[Array, " numbers"]
+    last: Float[Array, "2 delays"]
 
     @classmethod
     def begin(cls, t0: Time, first: Float[Array, " delays"], delay: Float[Array, " delays"], room: int) -> "Past":
@@ -56,7 +59,8 @@ class Past(eqx.Module):
         n = len(first)
         pieces = jnp.zeros((room, 2 + n + NODES * n), first.dtype).at[:, :2].set(jnp.inf)
         until = lax.stop_gradient(t0 + jnp.min(delay))
-        return cls(pieces, jnp.concatenate([jnp.stack([jnp.zeros_like(t0), t0, until]), jnp.ones(n), first]))
+        now = jnp.concatenate([jnp.stack([jnp.zeros_like(t0), t0, until]), jnp.ones(n, first.dtype), first])
+        return cls(pieces, now, still(jnp.stack([first, jnp.zeros_like(first)])))
 
     @property
     def n(self) -> int:
@@ -73,7 +77,7 @@ class Past(eqx.Module):
         """The past as the step from t0 to t1 reads it."""
         middle, side = 0.5 * (t0 + t1), SIDE * resolution
         low, high = jnp.minimum(t0 + side, middle), jnp.maximum(t1 - side, middle)
-        return Remembered(self, *still((low, high)), jnp.zeros_like(t0))
+        return Remembered(self, still(low), still(high), jnp.zeros_like(t0))
 
     def onwards(self, resolution: Time) -> "Remembered":
         """The past as it is read at an instant and from then on."""
@@ -101,17 +105,11 @@ class Remembered(eqx.Module):
         oldest = jnp.maximum(past.count.astype(int) - len(starts), 0)
         # Of rows that are read each source needs its own columns alone.
         rows = past.pieces[(oldest + jnp.maximum(number - 1, 0)) % len(starts)]
-        own = rows[:, 2 + n :].reshape(n, NODES, n)[np.arange(n), :, np.arange(n)]
-        begins, there = (
-            number == 0,
-            jnp.where(number[:, None] > 0, lax.stop_gradient(rows[:, :2]), jnp.array([0.0, 1.0])),
-        )
-        half = 0.5 * (there[:, 1] - there[:, 0])
-        place = (instant - there[:, 0]) / half - 1.0
-        powers = place[:, None] ** _POWERS
-        value = jnp.sum(own * powers, axis=1)
-        rate = jnp.sum(own[:, 1:] * _POWERS[1:] * powers[:, :-1], axis=1) / half
-        return jnp.where(begins, past.first, value), jnp.where(begins, 0.0, rate)
+        own = rows[:, 2 + n :].reshape(n, NODES, n)[np.arange(n), :, np.arange(n)].T
+        begins, (start, end) = number == 0, lax.stop_gradient(rows[:, :2]).T
+        half = jnp.where(begins, 1.0, 0.5 * (end - start))
+        value, rate = _evaluated(own, jnp.where(begins, 0.0, (instant - start) / half - 1.0))
+        return jnp.where(begins, past.first, value), jnp.where(begins, 0.0, rate / half)
 
 
 class Reached(NamedTuple):
@@ -121,6 +119,7 @@ class Reached(NamedTuple):
         parameters; `level`: the levels of these breaks; shape (delays,) each.
     - `request`: the end of the shorter step to take instead; infinity to keep this one.
     - `vanishes`: a delay is shorter than any step.
+    - `allowed`: how long the next step may be, for its pieces to be as exact as asked for.
     - `row`: the piece that the step leaves; `instants`: the times at which the past is read at its end.
     """
 
@@ -129,6 +128,7 @@ class Reached(NamedTuple):
     level: Array
     request: Time
     vanishes: Array
+    allowed: Time
     row: Array
     instants: Array
 
@@ -140,22 +140,30 @@ def reached(
     """Looks at the step from y0 to x1, whose states are `dense(t0, t1, t)`; `jumped` says whether inputs jump where it
     begins."""
     past, tolerance, h = y0.past, problem.resolution, t1 - t0
-    inside = t0 + h * jnp.asarray(0.5 * (1 + _PLACES[1:-1]), t1.dtype)
+    inside = t0 + h * jnp.asarray(0.5 * (1 + np.append(_PLACES[1:-1], BETWEEN)), t1.dtype)
     times = jnp.concatenate([t0[None], inside, t1[None]])
     states = jnp.concatenate([y0.x[None], jax.vmap(lambda t: dense(t0, t1, t))(inside), x1[None]])
     values, instants = jax.vmap(lambda t, x: problem.sources(t, x, y0.q, args))(times, states)
+    nodes = np.append(np.arange(NODES - 1), len(inside) + 1)
+    between, times = still(values[NODES - 1 : -1]), times[nodes]
+    values, instants = values[nodes], instants[nodes]
     levels = jnp.where(jumped, jnp.zeros_like(past.levels), past.levels)
     start = t0 + (past.begun - lax.stop_gradient(past.begun))
     fitted = jnp.asarray(_COEFFICIENTS, values.dtype)
     # Differences are fitted: what is constant, such as a whole number, comes out as it is.
     polynomials = (fitted @ (values - values[0])).at[0].add(values[0])
+    compared = jnp.asarray(np.vander(BETWEEN, NODES, increasing=True), values.dtype) @ still(polynomials)
+    off = jnp.max(jnp.abs(between - compared), axis=0)
+    error = jnp.max(off / problem.allowed(jnp.max(jnp.abs(still(values)), axis=0)))
+    longer = SAFETY * jnp.maximum(error, LONGEST**-NODES) ** (-1 / NODES)
+    # What was constant, and goes on as it was, has no break: of a network of gates, most have not turned.
+    goes_on = _is_constant(still(polynomials)) & (polynomials[0] == past.last[0]) & (past.last[1] == 0)
+    levels = jnp.where(goes_on, SMOOTH, levels)
     row = jnp.concatenate([jnp.stack([start, t1]), levels, polynomials.ravel()])
 
     now = lax.stop_gradient(instants)
-    starts, all_levels = (
-        jnp.append(past.pieces[:, 0], start),
-        jnp.append(past.pieces[:, 2 : 2 + past.n], levels[None], 0),
-    )
+    starts = jnp.append(past.pieces[:, 0], start)
+    all_levels = jnp.append(past.pieces[:, 2 : 2 + past.n], levels[None], 0)
     which, left = _next(starts, all_levels, now[0] + 2 * tolerance)
     breaks, level = starts[which], all_levels[which, np.arange(past.n)]
     passed = left & (now[-1] > breaks + tolerance)
@@ -172,8 +180,10 @@ def reached(
     far = jnp.max(now) > t0 + tolerance
     sooner = jnp.where(far, t0 + jnp.maximum(SHORTER * shortest, LEAST * h), jnp.inf)
     vanishes = far & (h <= 16 * tolerance)
-    request = jnp.where(vanishes, jnp.inf, jnp.minimum(where, sooner))
-    return Reached(due & ~jnp.isfinite(request), ticks, level, still(request), vanishes, row, now[-1])
+    coarse = jnp.where((error > 1) & (h > 64 * tolerance), t0 + h * jnp.maximum(longer, LEAST), jnp.inf)
+    request = jnp.where(vanishes, jnp.inf, jnp.minimum(jnp.minimum(where, sooner), coarse))
+    due = due & ~jnp.isfinite(request)
+    return Reached(due, ticks, level, still(request), vanishes, h * longer, row, now[-1])
 
 
 def _rates(problem: AbstractHybridProblem, t: Time, x: State, q: Array, args: Args, due: Array) -> Array:
@@ -218,8 +228,10 @@ def after(
     place = past.count.astype(int) % len(past.pieces)
     pieces = past.pieces.at[place].set(reach.row)
     delay = t1 - reach.instants
-    head = jnp.stack([past.count + 1, time, still(t1 + jnp.min(delay))])
-    new = Past(pieces, jnp.concatenate([head, levels, past.first]))
+    head = jnp.stack([past.count + 1, time, still(t1 + jnp.minimum(jnp.min(delay), reach.allowed))])
+    last = still(reach.row[2 + past.n :].reshape(NODES, past.n))
+    moves = jnp.where(_is_constant(last), 0.0, 1.0).astype(t1.dtype)
+    new = Past(pieces, jnp.concatenate([head, levels, past.first]), jnp.stack([jnp.sum(last, axis=0), moves]))
     starts, all_levels = jnp.append(pieces[:, 0], t1), jnp.append(pieces[:, 2 : 2 + past.n], levels[None], 0)
     which, left = _next(starts, all_levels, reach.instants + 2 * tolerance)
     due = jnp.where(left & np.array(facts.constant), t1 + (starts[which] - reach.instants), jnp.inf)
@@ -230,6 +242,19 @@ def is_full(past: Past, t: Time, longest: Array) -> Bool[Array, ""]:
     """True if the piece that is written over next is still needed."""
     oldest = past.pieces[past.count.astype(int) % len(past.pieces)]
     return (past.count >= len(past.pieces)) & (oldest[1] > t - jnp.max(longest))
+
+
+def _evaluated(polynomials: Array, places: Array) -> tuple[Array, Array]:
+    """The values of polynomials and of their derivatives, each at its own place, shape (delays,)."""
+    value, rate = polynomials[-1], jnp.zeros_like(places)
+    for coefficient in polynomials[-2::-1]:
+        value, rate = value * places + coefficient, rate * places + value
+    return value, rate
+
+
+def _is_constant(polynomials: Array) -> Array:
+    """True for polynomials without powers, shape (delays,)."""
+    return jnp.all(polynomials[1:] == 0, axis=0)
 
 
 def _next(starts: Array, levels: Array, since: Array) -> tuple[Array, Array]:
@@ -243,13 +268,10 @@ def _next(starts: Array, levels: Array, since: Array) -> tuple[Array, Array]:
 def _crossing(coefficients: Array, levels: Array) -> Array:
     """Where in [−1, 1] polynomials pass these levels, shape (delays,)."""
 
-    def value(place: Array) -> Array:
-        return jnp.sum(coefficients * place ** _POWERS[:, None], axis=0)
-
     def halved(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        beyond = value(middle) > levels
+        beyond = _evaluated(coefficients, middle)[0] > levels
         return jnp.where(beyond, low, middle), jnp.where(beyond, middle, high)
 
     one = jnp.ones_like(levels)

@@ -91,6 +91,10 @@ class AbstractHybridProblem(eqx.Module):
         """The longest delays."""
         raise NotImplementedError
 
+    def allowed(self, size: Float[Array, " delays"]) -> Float[Array, " delays"]:
+        """The error that is allowed in a record of what is delayed, given how large that is."""
+        raise NotImplementedError
+
     def with_past_read(self, t: Time, x: State, q: Array, args: Args) -> Float[Array, " q"]:
         """The discrete values with what equations read of the past, so that it is not needed any more."""
         return q
