@@ -57,17 +57,18 @@ class DelayDeclarations(DiscreteDeclarations):
         ```
 
         A run records the expression at six places of each step, along the dense output of the solver, and reads the
-        polynomial through them. Steps are not longer than the delay. They end where a jump, a kink or the beginning of
-        the record comes out of the delay, until five integrations have smoothed it. Derivatives by parameters, the
-        delay among them, pass through the record.
+        polynomial through them, which is compared with the expression in between. Where a step is longer than the
+        delay, what it reads is extrapolated, compared with what was, and the step is taken again if they differ by more
+        than the tolerance. Steps end where a jump, a kink or the beginning of the record comes out of the delay, until
+        five integrations have smoothed it. Derivatives by parameters, the delay among them, pass through the record.
 
         **Arguments:**
 
         - `name`: its local name.
         - `expression`: a number or an expression in variables, their derivatives, parameters and time.
         - `time`: the delay (second), positive. Without `longest`, a number or an expression in parameters.
-        - `longest`: a number or an expression in parameters that a changing `time` does not exceed. While `time`
-            changes, it must be longer than the steps: a delay that vanishes ends the run with an error.
+        - `longest`: a number or an expression in parameters that a changing `time` does not exceed. It may vanish; if
+            it becomes negative, the run ends with an error.
         - `unit`: shown in reports and plots.
 
         **Raises:**

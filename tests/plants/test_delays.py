@@ -60,7 +60,7 @@ LINE = {"m.Z": 50.0, "m.TD": 0.25, "m.Rs": 20.0, "m.RL": 200.0, "m.begin": 0.3}
 def waves(t, Z, TD, Rs, RL, begin):
     """(voltage at the load, its integral) by the diagram of bounces."""
     source, load = (Rs - Z) / (Rs + Z), (RL - Z) / (RL + Z)
-    k = jnp.arange(20)
+    k = jnp.arange(20.0)
     size = Z / (Rs + Z) * (1 + load) * (source * load) ** k
     since = t - begin - (2 * k + 1) * TD
     return jnp.sum(size * (since > 0)), jnp.sum(size * jnp.maximum(since, 0.0))
@@ -235,7 +235,7 @@ class Vanishing(Component):
 
 @pytest.mark.slow
 def test_a_delay_that_vanishes():
-    with pytest.raises(SimulationError, match="'m.late' becomes shorter than any step"):
+    with pytest.raises(SimulationError, match="the delay of 'm.late' is .* s and becomes negative"):
         simulate(compiled(Vanishing, "m"), 2.0)
 
 
@@ -277,3 +277,65 @@ def test_the_echo_of_an_event():
 
     assert abs(heard(0.3) - (math.sqrt(2 / 9.81) + 0.3)) < 1e-9
     assert abs(jax.grad(heard)(0.3) - 1.0) < 1e-9
+
+
+class Two(Component):
+    """Two delays that are equal by chance: what comes out of them at one instant moves with each of them."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        a, b = self.parameter("a", 0.5), self.parameter("b", 0.5)
+        x = self.variable("x", start=0.0, fixed=True)
+        pulse = Piecewise((0, ev.t < 1), (1, True))
+        first, second = self.delayed("first", pulse, a), self.delayed("second", 3 * pulse, b)
+        self.add_equations(Eq(der(x), first * (1 + second)))
+
+
+@pytest.mark.slow
+def test_breaks_that_come_out_at_once():
+    system = compiled(Two, "m")
+
+    def last(p):
+        return simulate(system.with_parameters({"m.a": p[0], "m.b": p[1]}), 2.0, ts=jnp.array([2.0]))["m.x"][0]
+
+    # From 1 + max(a, b) on dx/dt is 4, from 1 + a on 1 if that is first. So ∂x/∂b is −3 for b > a, and 0 else.
+    slopes = jax.grad(last)(jnp.array([0.5, 0.5]))
+    later, sooner = jnp.array([-1.0, -3.0]), jnp.array([-4.0, 0.0])
+    assert min(jnp.abs(slopes - one).max() for one in (later, sooner)) < 1e-12
+
+
+class Closing(Component):
+    """A delay that vanishes at t = π, and opens again."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, y = self.variable("x", start=0.0, fixed=True), self.variable("y", start=0.0, fixed=True)
+        late = self.delayed("late", x, 1 + sympy.cos(ev.t), longest=2)
+        self.add_equations(Eq(der(x), sympy.cos(ev.t)), Eq(der(y), late))
+
+
+@pytest.mark.slow
+def test_a_delay_that_vanishes_for_an_instant():
+    ts = jnp.linspace(0.0, 6.0, 25)
+    run = simulate(compiled(Closing, "m"), 6.0, ts=ts, **TIGHT)
+    assert np.abs(run["m.late"] - jnp.sin(jnp.maximum(ts - 1 - jnp.cos(ts), 0.0))).max() < 1e-8
+
+
+class Slow(Component):
+    """A delay that is short beside what happens."""
+
+    def __init__(self, ev, name, T=1e-4):
+        super().__init__(ev, name)
+        x = self.variable("x", start=1.0, fixed=True)
+        self.add_equations(Eq(der(x), -self.delayed("late", x, self.parameter("T", T))))
+
+
+@pytest.mark.slow
+def test_steps_longer_than_the_delay():
+    """x' = −x(t − T) from the solution exp(−ωt) with ω = exp(ωT), but for the constant beginning, of which (T) is left."""
+    T, omega = 1e-4, 1.0
+    for _ in range(50):
+        omega = math.exp(omega * T)
+    run = simulate(compiled(Slow, "m"), 5.0, ts=jnp.array([5.0]))
+    assert run.counts["num_steps"] < 2000  # of the length of the delay, they were 50,000
+    assert abs(run["m.x"][0] - math.exp(-5 * omega)) < 1e-6

@@ -80,5 +80,7 @@ def plan_delays(
         *read_variables(variables, table.source, program),
         *read_variables(variables, table.instant, program),
         parameters,
-        DelayFacts(tuple(clocks), table.constant, tuple(tuple(p in found for p in values) for found in read)),
+        DelayFacts(
+            tuple(clocks), tuple(begins), table.constant, tuple(tuple(p in found for p in values) for found in read)
+        ),
     )

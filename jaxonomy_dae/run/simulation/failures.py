@@ -64,7 +64,7 @@ def codes(result: Result, has_events: bool, max_steps: int, max_events: int) -> 
         (CLASH, "two events give one variable different values at one instant"),
         (NOT_ADMITTED, TEXT),
         (SINGULAR_CHOICE, "the states have become a singular choice"),
-        (VANISHED, "a delay has become shorter than any step"),
+        (VANISHED, "a delay has become negative, or too short for what it reads"),
         (FORGETS, "the record of what is delayed has too little room for the steps within the longest delay"),
         (
             of_diffrax.nonlinear_divergence,
@@ -176,9 +176,9 @@ def _of_delays(system: AcausalSystem, at: Stopped, inputs: Inputs) -> str:
     delay = float(at.t) - np.asarray(point.delayed(at.y)[1], float)
     k = int(np.argmin(delay))
     return (
-        f"the delay of '{delays.table.text[k]}' becomes shorter than any step; it is {delay[k]:.3g} s. A delay reads a "
-        "past that is complete: let it stay positive, for instance Max(time, least) with a least delay of the size of "
-        "the steps you expect"
+        f"the delay of '{delays.table.text[k]}' is {delay[k]:.3g} s and becomes negative, or it is so short that what it "
+        "reads follows itself without one. Only the past can be read: let the delay stay positive, for instance "
+        "Max(time, least)"
     )
 
 

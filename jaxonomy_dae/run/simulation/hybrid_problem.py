@@ -66,7 +66,7 @@ class SystemProblem(AbstractHybridProblem):
         if past is not None:
             problem = self.remembering(past.past.onwards(self.resolution), self.ticks)
         then, may_jump = (from_then_on(args, self.resolution), any_held(args)) if args else (args, False)
-        return problem, then, may_jump or past is not None
+        return problem, then, may_jump
 
     def remembering(self, past, ticks=None):
         return dataclasses.replace(self, system=dataclasses.replace(self.system, past=past), ticks=ticks)
@@ -105,7 +105,8 @@ class SystemProblem(AbstractHybridProblem):
             return y0
         first, instants = self.sources(t0, y0.x, y0.q, args)
         past = Past.begin(t0, first, t0 - instants, room)
-        return y0.but(past=past, due=begin_due(delays, past, t0, t0 - instants, y0.due))
+        q = y0.q.at[np.array(delays.begins)].set(0.0)
+        return y0.but(q=q, past=past, due=begin_due(delays, t0, t0 - instants, y0.due))
 
     def written(self, t, x, read, q, previous, events, args):
         plan = self.events

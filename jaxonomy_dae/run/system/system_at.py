@@ -73,7 +73,8 @@ class SystemAt:
         delays, networks = self._delays(), Networks(self.networks)
         at = Evaluation(self._chunk(x), inputs, self.parameters, t, networks, self.typical)
         instant = jax.lax.stop_gradient(self._filled(at.run(delays.instants, Refinement.NONE), delays.instant))
-        read = jnp.stack([jnp.zeros_like(instant), instant, *self.past.read(t, instant)], axis=1)
+        waits = self.parameters[delays.parameters[:, 0]] > 0
+        read = jnp.stack([jnp.zeros_like(instant), instant, *self.past.read(t, instant, waits)], axis=1)
         return self.parameters.at[delays.parameters].set(read)
 
     def _chunk(self, x: Chunk) -> Chunk:

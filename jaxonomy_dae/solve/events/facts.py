@@ -13,11 +13,13 @@ class DelayFacts:
     """What is known of delayed quantities before a run.
 
     - `clocks`: the number of the event of each, which happens where a break of the past comes out of the delay.
+    - `begins`: the place of the discrete value that this event sets to zero: 1 while a break waits for it.
     - `constant`: whether each delay is constant.
     - `passes`: for each source, which delayed quantities it follows algebraically, so that a jump of them is one of it.
     """
 
     clocks: tuple[int, ...]
+    begins: tuple[int, ...]
     constant: tuple[bool, ...]
     passes: tuple[tuple[bool, ...], ...]
 

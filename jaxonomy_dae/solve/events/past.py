@@ -1,7 +1,9 @@
 """The past of a run: what is delayed, recorded step by step and read where it comes out of the delay.
 
 A step leaves one piece: of each source the polynomial through its values at NODES places of the step, along the dense
-output of the solver. Steps are not longer than the delays, so that they read pieces that are complete.
+output of the solver. It is compared with the source in between. A step that is longer than a delay reads what it makes:
+that is extrapolated from the piece before, compared afterwards with what was, and the step is taken again, shorter, if
+they differ by more than the tolerance.
 
 Where a source jumps or has a kink, a piece begins with its *level*: the order of the derivative that jumps. At the time
 at which such a break comes out of a delay, a step ends and an event happens. The solution is smoother than what drives
@@ -31,8 +33,8 @@ LONGEST, SAFETY = 5.0, 0.9  # how much longer than the last step the pieces allo
 HIGHEST = 5.0
 SMOOTH = 99.0  # the level of a piece that begins without a break
 SIDE = 4.0  # times the resolution: nearer to a break, a step reads the piece that belongs to its inside
-SHORTER = 0.9  # of the shortest delay: the length of a step that is taken again, for it would have read what it makes
-LEAST = 0.25  # of its length: by no more it is shortened at once
+LEAST = 0.25  # of its length: by no more a step is shortened at once
+REACHES = 0.5  # of the last step: what can be extrapolated over less is not tried
 SEARCH = 60  # halvings, to rounding
 
 _PLACES = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # of Chebyshev and Lobatto, in [−1, 1]
@@ -58,7 +60,8 @@ class Past(eqx.Module):
         """No past but what the sources are at the initial time, where they begin to move."""
         n = len(first)
         pieces = jnp.zeros((room, 2 + n + NODES * n), first.dtype).at[:, :2].set(jnp.inf)
-        until = lax.stop_gradient(t0 + jnp.min(delay))
+        # A delay that is zero at the start limits nothing: what the first step reads is compared with what was.
+        until = lax.stop_gradient(t0 + jnp.min(jnp.where(delay > 0, delay, jnp.inf)))
         now = jnp.concatenate([jnp.stack([jnp.zeros_like(t0), t0, until]), jnp.ones(n, first.dtype), first])
         return cls(pieces, now, still(jnp.stack([first, jnp.zeros_like(first)])))
 
@@ -73,6 +76,17 @@ class Past(eqx.Module):
     levels = property(lambda self: self.now[..., 3 : 3 + self.n])
     first = property(lambda self: self.now[..., 3 + self.n :])
 
+    def extrapolated(self, times: Array, each: bool = False) -> Array:
+        """What the last pieces say of later times, not differentiated, shape (times, delays); with `each`, of one time
+        for each source, shape (delays,)."""
+        pieces, count, first, times = still((self.pieces, self.count, self.first, times))
+        row = pieces[(count.astype(int) - 1) % len(pieces)]
+        half = jnp.where(count > 0, 0.5 * (row[1] - row[0]), 1.0)
+        places = jnp.where(count > 0, (times - row[0]) / half - 1.0, 0.0)
+        polynomials = jnp.where(count > 0, row[2 + self.n :].reshape(NODES, self.n), 0.0)
+        value = _evaluated(polynomials, places if each else places[:, None])[0]
+        return jnp.where(count > 0, value, first)
+
     def between(self, t0: Time, t1: Time, resolution: Time) -> "Remembered":
         """The past as the step from t0 to t1 reads it."""
         middle, side = 0.5 * (t0 + t1), SIDE * resolution
@@ -86,20 +100,21 @@ class Past(eqx.Module):
 
 
 class Remembered(eqx.Module):
-    """The past on one side of its breaks: pieces are chosen by times moved into [low, high], and `ahead`."""
+    """The past on one side of its breaks: pieces are chosen by times moved into [low, high], and `ahead`; of sources
+    whose break waits for its event, back."""
 
     past: Past
     low: Time
     high: Time
     ahead: Time
 
-    def read(self, t: Time, instant: Float[Array, " delays"]) -> tuple[Array, Array]:
+    def read(self, t: Time, instant: Float[Array, " delays"], waits: Bool[Array, " delays"]) -> tuple[Array, Array]:
         """Returns (what the sources were, their rates) at one instant for each, at the time t; constant under
         derivatives by `t` and `instant`."""
         past, n = self.past, self.past.n
         t, instant, moves = still((t, instant, (self.low, self.high, self.ahead)))
         low, high, ahead = moves
-        at = instant + (jnp.clip(t, low, high) - t) + ahead
+        at = instant + (jnp.clip(t, low, high) - t) + jnp.where(waits, -ahead, ahead)
         starts = lax.stop_gradient(past.pieces[:, 0])
         number = jnp.sum(starts[:, None] <= at, axis=0)
         oldest = jnp.maximum(past.count.astype(int) - len(starts), 0)
@@ -118,8 +133,8 @@ class Reached(NamedTuple):
     - `due`: the delays out of which a break comes at the end of the step; `ticks`: when it does, which moves with
         parameters; `level`: the levels of these breaks; shape (delays,) each.
     - `request`: the end of the shorter step to take instead; infinity to keep this one.
-    - `vanishes`: a delay is shorter than any step.
-    - `allowed`: how long the next step may be, for its pieces to be as exact as asked for.
+    - `vanishes`: a delay is negative, or what it reads changes however short the step is.
+    - `allowed`: how long the next step may be, for what it leaves and reads to be as exact as asked for.
     - `row`: the piece that the step leaves; `instants`: the times at which the past is read at its end.
     """
 
@@ -145,17 +160,16 @@ def reached(
     states = jnp.concatenate([y0.x[None], jax.vmap(lambda t: dense(t0, t1, t))(inside), x1[None]])
     values, instants = jax.vmap(lambda t, x: problem.sources(t, x, y0.q, args))(times, states)
     nodes = np.append(np.arange(NODES - 1), len(inside) + 1)
-    between, times = still(values[NODES - 1 : -1]), times[nodes]
-    values, instants = values[nodes], instants[nodes]
+    all_times, all_values, between = times, still(values), still(values[NODES - 1 : -1])
+    times, values, instants = times[nodes], values[nodes], instants[nodes]
     levels = jnp.where(jumped, jnp.zeros_like(past.levels), past.levels)
     start = t0 + (past.begun - lax.stop_gradient(past.begun))
     fitted = jnp.asarray(_COEFFICIENTS, values.dtype)
     # Differences are fitted: what is constant, such as a whole number, comes out as it is.
     polynomials = (fitted @ (values - values[0])).at[0].add(values[0])
     compared = jnp.asarray(np.vander(BETWEEN, NODES, increasing=True), values.dtype) @ still(polynomials)
-    off = jnp.max(jnp.abs(between - compared), axis=0)
-    error = jnp.max(off / problem.allowed(jnp.max(jnp.abs(still(values)), axis=0)))
-    longer = SAFETY * jnp.maximum(error, LONGEST**-NODES) ** (-1 / NODES)
+    allowed = problem.allowed(jnp.max(jnp.abs(all_values), axis=0))
+    error = jnp.max(jnp.abs(between - compared) / allowed)
     # What was constant, and goes on as it was, has no break: of a network of gates, most have not turned.
     goes_on = _is_constant(still(polynomials)) & (polynomials[0] == past.last[0]) & (past.last[1] == 0)
     levels = jnp.where(goes_on, SMOOTH, levels)
@@ -176,14 +190,34 @@ def reached(
 
     where = lax.cond(any_member(jnp.any(passed)), located, lambda: jnp.full_like(t1, jnp.inf))
     where = jnp.where(jnp.isfinite(where), jnp.maximum(where, t0 + 2 * tolerance), where)
-    shortest = jnp.min(times[:, None] - now)
-    far = jnp.max(now) > t0 + tolerance
-    sooner = jnp.where(far, t0 + jnp.maximum(SHORTER * shortest, LEAST * h), jnp.inf)
-    vanishes = far & (h <= 16 * tolerance)
-    coarse = jnp.where((error > 1) & (h > 64 * tolerance), t0 + h * jnp.maximum(longer, LEAST), jnp.inf)
+    # What a step reads beyond its beginning is extrapolated from the piece before.
+    ahead = past.extrapolated(all_times)
+    differs = jnp.abs(all_values - ahead) / allowed
+    beyond, delays = jnp.max(now, axis=0), times[:, None] - now
+    wrong = jnp.max(jnp.where(all_times[:, None] <= beyond, differs, 0.0), axis=0)
+    own = _evaluated(still(polynomials), (beyond - t0) / (0.5 * h) - 1.0)[0]
+    last = jnp.abs(own - past.extrapolated(beyond, each=True)) / allowed
+    wrong = jnp.max(jnp.where(beyond > t0 + tolerance, jnp.maximum(wrong, last), 0.0))
+    future = jnp.min(delays) < -tolerance
+    sooner = jnp.minimum(SAFETY, jnp.maximum(_length(wrong), LEAST)) * h
+    sooner = jnp.where(future, LEAST * h, jnp.maximum(sooner, jnp.minimum(jnp.min(delays), SAFETY * h)))
+    again = future | (wrong > 1)
+    sooner = jnp.where(again, t0 + sooner, jnp.inf)
+    coarse = jnp.where((error > 1) & (h > 64 * tolerance), t0 + h * jnp.maximum(_length(error), LEAST), jnp.inf)
+    vanishes = again & (h <= 16 * tolerance)
     request = jnp.where(vanishes, jnp.inf, jnp.minimum(jnp.minimum(where, sooner), coarse))
     due = due & ~jnp.isfinite(request)
-    return Reached(due, ticks, level, still(request), vanishes, h * longer, row, now[-1])
+    # How far beyond the end of this step its pieces may be extrapolated, as the last ones could over this step.
+    most = jnp.max(differs, axis=0)
+    reach = jnp.where(most == 0, jnp.inf, _length(most) * h)
+    reach = jnp.where(reach < REACHES * h, 0.0, reach)
+    longest = jnp.minimum(_length(error) * h, jnp.min(delays[-1] + reach))
+    return Reached(due, ticks, level, still(request), vanishes, jnp.maximum(longest, LEAST * h), row, now[-1])
+
+
+def _length(error: Array) -> Array:
+    """The length, as a part of a step, of one whose error is what is allowed, given the error of that step."""
+    return SAFETY * jnp.maximum(error, LONGEST**-NODES) ** (-1 / NODES)
 
 
 def _rates(problem: AbstractHybridProblem, t: Time, x: State, q: Array, args: Args, due: Array) -> Array:
@@ -206,10 +240,17 @@ def _facts(problem: AbstractHybridProblem) -> DelayFacts:
     return problem.facts.delays
 
 
-def begin_due(facts: DelayFacts, past: Past, t0: Time, delay: Array, due: Array) -> Array:
+def begin_due(facts: DelayFacts, t0: Time, delay: Array, due: Array) -> Array:
     """When each clock is due at the beginning of a run, those of the delays included."""
     ends = jnp.where(np.array(facts.constant), t0 + delay, jnp.inf)
     return due.at[np.array(facts.clocks)].set(still(ends))
+
+
+def waiting(facts: DelayFacts, state: HybridState, due: Bool[Array, " events"]) -> HybridState:
+    """The state before the events of an instant. Of several breaks that come out at once each has an event, and a time
+    that moves with parameters of its own: equations read on until its event what was before it."""
+    waits = due[np.array(facts.clocks)].astype(state.q.dtype)
+    return state.but(q=state.q.at[np.array(facts.begins)].set(waits))
 
 
 def after(
@@ -227,15 +268,15 @@ def after(
     levels = still(jnp.where(others, jnp.zeros_like(levels), levels)).astype(t1.dtype)
     place = past.count.astype(int) % len(past.pieces)
     pieces = past.pieces.at[place].set(reach.row)
-    delay = t1 - reach.instants
-    head = jnp.stack([past.count + 1, time, still(t1 + jnp.minimum(jnp.min(delay), reach.allowed))])
+    head = jnp.stack([past.count + 1, time, still(t1 + reach.allowed)])
     last = still(reach.row[2 + past.n :].reshape(NODES, past.n))
     moves = jnp.where(_is_constant(last), 0.0, 1.0).astype(t1.dtype)
     new = Past(pieces, jnp.concatenate([head, levels, past.first]), jnp.stack([jnp.sum(last, axis=0), moves]))
     starts, all_levels = jnp.append(pieces[:, 0], t1), jnp.append(pieces[:, 2 : 2 + past.n], levels[None], 0)
     which, left = _next(starts, all_levels, reach.instants + 2 * tolerance)
     due = jnp.where(left & np.array(facts.constant), t1 + (starts[which] - reach.instants), jnp.inf)
-    return y1.but(past=new, due=y1.due.at[np.array(facts.clocks)].set(still(due)))
+    due = y1.due.at[np.array(facts.clocks)].set(still(due))
+    return y1.but(past=new, due=due, q=y1.q.at[np.array(facts.begins)].set(0.0))
 
 
 def is_full(past: Past, t: Time, longest: Array) -> Bool[Array, ""]:

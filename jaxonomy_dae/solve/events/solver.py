@@ -19,7 +19,7 @@ from .event_map import handle, most_at_once
 from .kinks import turned
 from .log import EventRows
 from .looking import looked_at
-from .past import after, is_full, reached
+from .past import after, is_full, reached, waiting
 from .problem import HybridState, bound, problem_after, problem_of
 
 MOVED = 1e3  # times the resolution: with a longer step time has gone on, and turns at one instant are counted anew
@@ -137,28 +137,32 @@ class WithEvents(WrappedSolver):
         state = y0.but(
             x=x1, armed=armed, size=arrival.size, span=arrival.span, request=request, turns=turns, iteration=iteration
         )
+        if delays is not None:
+            state = waiting(delays, state, arrival.due)
         fired = jnp.any(arrival.due)
 
         noted = EventRows.empty(
             min(self.room, most_at_once(problem)), self.sides, len(y0.x) + len(y0.q), jnp.result_type(t1)
         )
-        none = jnp.zeros_like(x1), noted, t1
+        # The time of the last event, which moves with parameters, is one of the breaks of the past.
+        none = jnp.zeros_like(x1), noted, *([] if delays is None else [t1])
 
         def events(state):
-            return handle(problem, t1, state, arrival, args, noted)
+            return handle(problem, t1, state, arrival, args, noted)[: 1 + len(none)]
 
         # Where all events are kinks, what happens is a few selects. No branch is needed, and no slope.
         if problem.facts.only_kinks:
             _, then, _ = problem.at_instant(args)
             y1, slope = turned(problem, t1, state, values, arrival.due, then), jnp.zeros_like(x1)
         else:
-            y1, slope, noted, time = lax.cond(any_member(fired), events, lambda state: (state, *none), state)
+            y1, slope, noted, *time = lax.cond(any_member(fired), events, lambda state: (state, *none), state)
             # The branch is taken if any member of a batch has an event; the others keep their states.
             y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
             if delays is not None and reach is not None:
                 ticked = (y1.ticks != state.ticks) & ~np.isin(np.arange(problem.facts.n_clocks), delays.clocks)
                 others = jnp.any(ticked) | (y1.turns != state.turns)
-                y1 = after(delays, t1, before, y1, reach, jnp.where(fired, time, t1), others, problem.resolution)
+                begun = jnp.where(fired, time[0], t1)
+                y1 = after(delays, t1, before, y1, reach, begun, others, problem.resolution)
         dense_info = dict(
             inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution, **{NOTED: noted}
         )
