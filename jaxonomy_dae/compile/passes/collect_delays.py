@@ -35,5 +35,5 @@ def delay_table(model: ModelNumbers) -> DelayTable:
         read.append([place[parameter(i, name, row)] for name in names])
         longest.append(in_parameters(model, parameter, i, row, delay.longest))
         constant.append(delay.is_constant)
-    columns = (np.array(column, np.int64) for column in (source, instant, read))
-    return DelayTable(tuple(text), *columns, tuple(longest), tuple(constant))
+    source, instant, read = (np.array(column, np.int64) for column in (source, instant, read))
+    return DelayTable(tuple(text), source, instant, read, tuple(longest), tuple(constant))

@@ -176,8 +176,8 @@ def _of_delays(system: AcausalSystem, at: Stopped, inputs: Inputs) -> str:
     delay = float(at.t) - np.asarray(point.delayed(at.y)[1], float)
     k = int(np.argmin(delay))
     return (
-        f"the delay of '{delays.table.text[k]}' is {delay[k]:.3g} s and becomes negative, or it is so short that what it "
-        "reads follows itself without one. Only the past can be read: let the delay stay positive, for instance "
+        f"the delay of '{delays.table.text[k]}' is {delay[k]:.3g} s and becomes negative, or it is so short that what "
+        "it reads follows itself without one. Only the past can be read: let the delay stay positive, for instance "
         "Max(time, least)"
     )
 

@@ -11,6 +11,7 @@ it by one derivative (Bellen & Zennaro 2003, Numerical Methods for Delay Differe
 comes of the break has the next level, unless the source follows what is delayed without an integration between.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -76,6 +77,11 @@ class Past(eqx.Module):
     levels = property(lambda self: self.now[..., 3 : 3 + self.n])
     first = property(lambda self: self.now[..., 3 + self.n :])
 
+    @property
+    def levels_of_pieces(self) -> Array:
+        """The levels of the pieces, shape (room, delays)."""
+        return self.pieces[:, 2 : 2 + self.n]
+
     def extrapolated(self, times: Array, each: bool = False) -> Array:
         """What the last pieces say of later times, not differentiated, shape (times, delays); with `each`, of one time
         for each source, shape (delays,)."""
@@ -108,6 +114,10 @@ class Remembered(eqx.Module):
     high: Time
     ahead: Time
 
+    def of(self, past: Past) -> "Remembered":
+        """The same side of another past."""
+        return dataclasses.replace(self, past=past)
+
     def read(self, t: Time, instant: Float[Array, " delays"], waits: Bool[Array, " delays"]) -> tuple[Array, Array]:
         """Returns (what the sources were, their rates) at one instant for each, at the time t; constant under
         derivatives by `t` and `instant`."""
@@ -135,7 +145,7 @@ class Reached(NamedTuple):
     - `request`: the end of the shorter step to take instead; infinity to keep this one.
     - `vanishes`: a delay is negative, or what it reads changes however short the step is.
     - `allowed`: how long the next step may be, for what it leaves and reads to be as exact as asked for.
-    - `row`: the piece that the step leaves; `instants`: the times at which the past is read at its end.
+    - `past`: with the piece that the step leaves; `instants`: the times at which it is read at the end of the step.
     """
 
     due: Bool[Array, " delays"]
@@ -144,7 +154,7 @@ class Reached(NamedTuple):
     request: Time
     vanishes: Array
     allowed: Time
-    row: Array
+    past: Past
     instants: Array
 
 
@@ -174,10 +184,16 @@ def reached(
     goes_on = _is_constant(still(polynomials)) & (polynomials[0] == past.last[0]) & (past.last[1] == 0)
     levels = jnp.where(goes_on, SMOOTH, levels)
     row = jnp.concatenate([jnp.stack([start, t1]), levels, polynomials.ravel()])
+    moves = jnp.where(_is_constant(still(polynomials)), 0.0, 1.0).astype(t1.dtype)
+    longer = Past(
+        past.pieces.at[past.count.astype(int) % len(past.pieces)].set(row),
+        past.now.at[0].add(1.0),
+        jnp.stack([jnp.sum(still(polynomials), axis=0), moves]),
+    )
 
     now = lax.stop_gradient(instants)
     starts = jnp.append(past.pieces[:, 0], start)
-    all_levels = jnp.append(past.pieces[:, 2 : 2 + past.n], levels[None], 0)
+    all_levels = jnp.append(past.levels_of_pieces, levels[None], 0)
     which, left = _next(starts, all_levels, now[0] + 2 * tolerance)
     breaks, level = starts[which], all_levels[which, np.arange(past.n)]
     passed = left & (now[-1] > breaks + tolerance)
@@ -212,7 +228,7 @@ def reached(
     reach = jnp.where(most == 0, jnp.inf, _length(most) * h)
     reach = jnp.where(reach < REACHES * h, 0.0, reach)
     longest = jnp.minimum(_length(error) * h, jnp.min(delays[-1] + reach))
-    return Reached(due, ticks, level, still(request), vanishes, jnp.maximum(longest, LEAST * h), row, now[-1])
+    return Reached(due, ticks, level, still(request), vanishes, jnp.maximum(longest, LEAST * h), longer, now[-1])
 
 
 def _length(error: Array) -> Array:
@@ -254,26 +270,19 @@ def waiting(facts: DelayFacts, state: HybridState, due: Bool[Array, " events"]) 
 
 
 def after(
-    facts: DelayFacts, t1: Time, before: HybridState, y1: HybridState, reach: Reached, time: Time, others: Numeric,
-    tolerance: Time,
+    facts: DelayFacts, t1: Time, y1: HybridState, reach: Reached, time: Time, others: Numeric, tolerance: Time
 ) -> HybridState:  # fmt: skip
-    """The state `y1` after a step from `before` with the piece that it leaves, and with the times at which the next
-    breaks come out. `time` is that of the events at its end, `others` says whether there were any but those of
-    delays."""
-    past = before.past
+    """The state `y1` after a step, with its past and the times at which the next breaks come out. `time` is that of the
+    events at its end, `others` says whether there were any but those of delays."""
+    past = reach.past
     # Of several that come out at once the lowest level counts.
-    passes = np.array(facts.passes)
-    own = jnp.where(passes, reach.level, reach.level + 1.0)
+    own = jnp.where(np.array(facts.passes), reach.level, reach.level + 1.0)
     levels = jnp.min(jnp.where(reach.due, own, SMOOTH), axis=1)
     levels = still(jnp.where(others, jnp.zeros_like(levels), levels)).astype(t1.dtype)
-    place = past.count.astype(int) % len(past.pieces)
-    pieces = past.pieces.at[place].set(reach.row)
-    head = jnp.stack([past.count + 1, time, still(t1 + reach.allowed)])
-    last = still(reach.row[2 + past.n :].reshape(NODES, past.n))
-    moves = jnp.where(_is_constant(last), 0.0, 1.0).astype(t1.dtype)
-    new = Past(pieces, jnp.concatenate([head, levels, past.first]), jnp.stack([jnp.sum(last, axis=0), moves]))
-    starts, all_levels = jnp.append(pieces[:, 0], t1), jnp.append(pieces[:, 2 : 2 + past.n], levels[None], 0)
-    which, left = _next(starts, all_levels, reach.instants + 2 * tolerance)
+    head = jnp.stack([past.count, time, still(t1 + reach.allowed)])
+    new = dataclasses.replace(past, now=jnp.concatenate([head, levels, past.first]))
+    starts = jnp.append(past.pieces[:, 0], t1)
+    which, left = _next(starts, jnp.append(past.levels_of_pieces, levels[None], 0), reach.instants + 2 * tolerance)
     due = jnp.where(left & np.array(facts.constant), t1 + (starts[which] - reach.instants), jnp.inf)
     due = y1.due.at[np.array(facts.clocks)].set(still(due))
     return y1.but(past=new, due=due, q=y1.q.at[np.array(facts.begins)].set(0.0))

@@ -120,13 +120,14 @@ class WithEvents(WrappedSolver):
             rewrapped(terms, problem.term(y0.q)), t0, t1, y0.x, args, inner_state, made_jump
         )
         dense = _DenseOutput(solver.interpolation_cls, info)
-        before, reach = y0, None
+        reach = None
         if delays is not None:
             reach = reached(problem, dense, t0, t1, y0, x1, args, inputs_jumped)
             # The times at which breaks come out of delays are found here, and clocks read them.
             due = still(jnp.where(reach.due, t1, jnp.inf))
             y0 = y0.but(due=y0.due.at[np.array(delays.clocks)].set(due))
-            problem = problem.remembering(remembered, reach.ticks)
+            # What comes out now may be of this very step.
+            problem = problem.remembering(remembered.of(reach.past), reach.ticks)
         request, armed, values, arrival = looked_at(problem, dense, t0, t1, y0, x1, args)
         if reach is not None:
             arrival = arrival._replace(due=arrival.due & ~jnp.isfinite(reach.request))
@@ -162,7 +163,7 @@ class WithEvents(WrappedSolver):
                 ticked = (y1.ticks != state.ticks) & ~np.isin(np.arange(problem.facts.n_clocks), delays.clocks)
                 others = jnp.any(ticked) | (y1.turns != state.turns)
                 begun = jnp.where(fired, time[0], t1)
-                y1 = after(delays, t1, before, y1, reach, begun, others, problem.resolution)
+                y1 = after(delays, t1, y1, reach, begun, others, problem.resolution)
         dense_info = dict(
             inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution, **{NOTED: noted}
         )
