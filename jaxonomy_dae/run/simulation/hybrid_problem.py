@@ -2,13 +2,14 @@
 
 import dataclasses
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ...base.aliases import Args, State, Time, Tolerance
+from ...base.aliases import Args, Controller, State, Time, Tolerance
 from ...base.tolerances import CONSISTENT, RESOLUTION
 from ...compile.lowering.plan_events import EventPlan
 from ...solve.adjoint.resting import still
@@ -189,3 +190,31 @@ def without_clocked(system: AcausalSystem, q: Array) -> Array:
     if not len(chosen):
         return q
     return q.at[chosen].set(jnp.asarray(system.plan.flat.parameters.starts_of(events.discrete[chosen]), q.dtype))
+
+
+def saved_with_events(t: Time, y: HybridState, args: Args) -> State:
+    """What is saved of a state: (x, q, the sides of guards and the counts of ticks)."""
+    return y.x, y.q, jax.lax.stop_gradient(jnp.concatenate([y.armed, y.ticks]))
+
+
+class SavedWithPast(eqx.Module):
+    """What is saved of a state with a past: discrete values have what equations read of it."""
+
+    problem: SystemProblem
+
+    def __call__(self, t: Time, y: HybridState, args: Args) -> State:
+        return saved_with_events(t, y.but(q=self.held(t, y, args)), args)
+
+    def held(self, t: Time, y: HybridState, args: Args) -> Array:
+        """The discrete values at a time."""
+        problem = self.problem.remembering(y.past.onwards(self.problem.resolution))
+        return problem.with_past_read(t, y.x, y.q, args)
+
+
+def tolerances_of_a_record(controller: Controller, atol: Tolerance) -> tuple[Tolerance, Tolerance]:
+    """The absolute and the relative tolerance of a record of what is delayed; where steps are prescribed, all is as
+    exact as they are."""
+    while isinstance(controller, diffrax.ClipStepSizeController):
+        controller = controller.controller
+    rtol = getattr(controller, "rtol", None)
+    return (1e30, 1.0) if rtol is None else (atol, jax.lax.stop_gradient(rtol))

@@ -29,8 +29,15 @@ from ..system.system import AcausalSystem
 from .arguments import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .from_state import from_state
-from .hybrid_problem import SystemProblem, problem_for, without_clocked
-from .preparation import SAVED_ITERATIONS, largest_tolerance, prepared, term_of, tolerances_of_a_record
+from .hybrid_problem import (
+    SavedWithPast,
+    SystemProblem,
+    problem_for,
+    saved_with_events,
+    tolerances_of_a_record,
+    without_clocked,
+)
+from .preparation import SAVED_ITERATIONS, largest_tolerance, prepared, term_of
 from .saved_state import Memory, SavedState, same_time
 from .step_sizes import first_step
 
@@ -168,7 +175,7 @@ def run(
     end: HybridState = done.last[1]
     with_events = parts.problem is not None
     held = end.q if with_events else None
-    if isinstance(fn, _WithPast):
+    if isinstance(fn, SavedWithPast):
         held = fn.held(done.last[0], end, given.inputs)
     return Outcome(
         found=begin.found._replace(jacobian=None), ts=rows.ts, x=x, last=rows.last, stats=done.stats,
@@ -233,7 +240,7 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
     q0 = q0 if resumed is None else without_clocked(system, q0)
     y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
     y0 = problem.with_past(t0, y0, inputs, options.remembered)
-    saved = _with_events if system.plan.delays is None else _WithPast(problem)
+    saved = saved_with_events if system.plan.delays is None else SavedWithPast(problem)
     clashes = y0.stuck < -1
     return _Parts(
         term=HybridTerm(problem), solver=WithEvents(chosen, options.max_events, options.room, options.save_events),
@@ -305,21 +312,3 @@ run_compiled = compiled(run)
 
 def _whole(t: Time, y: State, args: Args) -> State:
     return y
-
-
-def _with_events(t: Time, y: HybridState, args: Args) -> State:
-    return y.x, y.q, jax.lax.stop_gradient(jnp.concatenate([y.armed, y.ticks]))
-
-
-class _WithPast(eqx.Module):
-    """What is saved of a state with a past: discrete values have what equations read of it."""
-
-    problem: SystemProblem
-
-    def __call__(self, t: Time, y: HybridState, args: Args) -> State:
-        return _with_events(t, y.but(q=self.held(t, y, args)), args)
-
-    def held(self, t: Time, y: HybridState, args: Args) -> Array:
-        """The discrete values at a time."""
-        problem = self.problem.remembering(y.past.onwards(self.problem.resolution))
-        return problem.with_past_read(t, y.x, y.q, args)

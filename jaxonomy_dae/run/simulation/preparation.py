@@ -80,15 +80,6 @@ def largest_tolerance(system: AcausalSystem, controller: Controller) -> Toleranc
     )
 
 
-def tolerances_of_a_record(controller: Controller, atol: Tolerance) -> tuple[Tolerance, Tolerance]:
-    """The absolute and the relative tolerance of a record of what is delayed; where steps are prescribed, all is as
-    exact as they are."""
-    while isinstance(controller, diffrax.ClipStepSizeController):
-        controller = controller.controller
-    rtol = getattr(controller, "rtol", None)
-    return (1e30, 1.0) if rtol is None else (atol, jax.lax.stop_gradient(rtol))
-
-
 def _unchanged(t: Time, x: State, args: Args) -> State:
     """The projection for an implicit solver of a system without constraints: it solves nonlinear blocks itself."""
     return x
