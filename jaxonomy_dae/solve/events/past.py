@@ -45,8 +45,9 @@ _COEFFICIENTS = np.linalg.inv(np.vander(_PLACES, increasing=True))
 class Past(eqx.Module):
     """The pieces of the last steps, in a ring.
 
-    - `pieces`: a row for each: start, end, levels (delays), coefficients (NODES·delays) in powers of a place in
-        [−1, 1]. A start moves with the break that it is, while the polynomial belongs to the step as it was taken.
+    - `pieces`: a row for each: the break that it begins with, start, end, levels (delays), coefficients
+        (NODES·delays) in powers of a place in [−1, 1]. Break and start are one time, but a break moves with parameters,
+        and the polynomial belongs to the step as it was taken.
     - `now`: the number of pieces so far, the time at which the next one begins, that at which its step must end at the
         latest, its levels, and what sources were at the initial time.
     - `last`: what sources were at the end of the last piece, and 0 for those that were constant in it, else 1.
@@ -60,7 +61,7 @@ class Past(eqx.Module):
     def begin(cls, t0: Time, first: Float[Array, " delays"], delay: Float[Array, " delays"], room: int) -> "Past":
         """No past but what the sources are at the initial time, where they begin to move."""
         n = len(first)
-        pieces = jnp.zeros((room, 2 + n + NODES * n), first.dtype).at[:, :2].set(jnp.inf)
+        pieces = jnp.zeros((room, 3 + n + NODES * n), first.dtype).at[:, :3].set(jnp.inf)
         # A delay that is zero at the start limits nothing: what the first step reads is compared with what was.
         until = lax.stop_gradient(t0 + jnp.min(jnp.where(delay > 0, delay, jnp.inf)))
         now = jnp.concatenate([jnp.stack([jnp.zeros_like(t0), t0, until]), jnp.ones(n, first.dtype), first])
@@ -80,16 +81,16 @@ class Past(eqx.Module):
     @property
     def levels_of_pieces(self) -> Array:
         """The levels of the pieces, shape (room, delays)."""
-        return self.pieces[:, 2 : 2 + self.n]
+        return self.pieces[:, 3 : 3 + self.n]
 
     def extrapolated(self, times: Array, each: bool = False) -> Array:
         """What the last pieces say of later times, not differentiated, shape (times, delays); with `each`, of one time
         for each source, shape (delays,)."""
         pieces, count, first, times = still((self.pieces, self.count, self.first, times))
         row = pieces[(count.astype(int) - 1) % len(pieces)]
-        half = jnp.where(count > 0, 0.5 * (row[1] - row[0]), 1.0)
-        places = jnp.where(count > 0, (times - row[0]) / half - 1.0, 0.0)
-        polynomials = jnp.where(count > 0, row[2 + self.n :].reshape(NODES, self.n), 0.0)
+        half = jnp.where(count > 0, 0.5 * (row[2] - row[1]), 1.0)
+        places = jnp.where(count > 0, (times - row[1]) / half - 1.0, 0.0)
+        polynomials = jnp.where(count > 0, row[3 + self.n :].reshape(NODES, self.n), 0.0)
         value = _evaluated(polynomials, places if each else places[:, None])[0]
         return jnp.where(count > 0, value, first)
 
@@ -130,9 +131,10 @@ class Remembered(eqx.Module):
         oldest = jnp.maximum(past.count.astype(int) - len(starts), 0)
         # Of rows that are read each source needs its own columns alone.
         rows = past.pieces[(oldest + jnp.maximum(number - 1, 0)) % len(starts)]
-        own = rows[:, 2 + n :].reshape(n, NODES, n)[np.arange(n), :, np.arange(n)].T
-        begins, (start, end) = number == 0, lax.stop_gradient(rows[:, :2]).T
-        half = jnp.where(begins, 1.0, 0.5 * (end - start))
+        own = rows[:, 3 + n :].reshape(n, NODES, n)[np.arange(n), :, np.arange(n)].T
+        begins = number == 0
+        start, end = jnp.where(begins[:, None], jnp.arange(2, dtype=rows.dtype), rows[:, 1:3]).T
+        half = 0.5 * (end - start)
         value, rate = _evaluated(own, jnp.where(begins, 0.0, (instant - start) / half - 1.0))
         return jnp.where(begins, past.first, value), jnp.where(begins, 0.0, rate / half)
 
@@ -183,7 +185,7 @@ def reached(
     # What was constant, and goes on as it was, has no break: of a network of gates, most have not turned.
     goes_on = _is_constant(still(polynomials)) & (polynomials[0] == past.last[0]) & (past.last[1] == 0)
     levels = jnp.where(goes_on, SMOOTH, levels)
-    row = jnp.concatenate([jnp.stack([start, t1]), levels, polynomials.ravel()])
+    row = jnp.concatenate([jnp.stack([start, t0, t1]), levels, polynomials.ravel()])
     moves = jnp.where(_is_constant(still(polynomials)), 0.0, 1.0).astype(t1.dtype)
     longer = Past(
         past.pieces.at[past.count.astype(int) % len(past.pieces)].set(row),
@@ -291,7 +293,7 @@ def after(
 def is_full(past: Past, t: Time, longest: Array) -> Bool[Array, ""]:
     """True if the piece that is written over next is still needed."""
     oldest = past.pieces[past.count.astype(int) % len(past.pieces)]
-    return (past.count >= len(past.pieces)) & (oldest[1] > t - jnp.max(longest))
+    return (past.count >= len(past.pieces)) & (oldest[2] > t - jnp.max(longest))
 
 
 def _evaluated(polynomials: Array, places: Array) -> tuple[Array, Array]:

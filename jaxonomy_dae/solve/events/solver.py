@@ -111,9 +111,9 @@ class WithEvents(WrappedSolver):
         # Diffrax knows the jumps that its controller reports. That an event ended the last step is known here: methods
         # with a history, or with a slope kept from the last stage, begin anew after it.
         inputs_jumped, made_jump = made_jump, jumped if made_jump is False else made_jump | jumped
-        delays, remembered = problem.facts.delays, None
-        if delays is not None:
-            remembered = y0.past.between(t0, t1, problem.resolution)
+        delays = problem.facts.delays
+        remembered = None if delays is None else y0.past.between(t0, t1, problem.resolution)
+        if remembered is not None:
             problem = problem.remembering(remembered)
         solver = problem.prepared(self.solver, y0.q)
         x1, y_error, info, inner_state, result = solver.step(
@@ -121,7 +121,7 @@ class WithEvents(WrappedSolver):
         )
         dense = _DenseOutput(solver.interpolation_cls, info)
         reach = None
-        if delays is not None:
+        if delays is not None and remembered is not None:
             reach = reached(problem, dense, t0, t1, y0, x1, args, inputs_jumped)
             # The times at which breaks come out of delays are found here, and clocks read them.
             due = still(jnp.where(reach.due, t1, jnp.inf))
