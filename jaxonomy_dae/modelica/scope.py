@@ -70,7 +70,7 @@ class Scope:
         self.being: list[str] = []
         special: dict[str, Callable[..., Value]] = {
             "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self._is_initial,
-            "terminal": lambda: False, "sample": self._sample, SAMPLED: self._sampled, "delay": _delay,
+            "terminal": lambda: False, "sample": self._sample, SAMPLED: self._sampled, "delay": self._delay,
         }  # fmt: skip
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
         special[TIME_TABLE] = self._time_table
@@ -96,6 +96,7 @@ class Scope:
         self.fields.update(fields)
         self.definitions = find_definitions(self.flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
+        self.delays: dict[tuple[Value, Value, Value], sympy.Symbol] = {}
         self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.carried_out: dict[int, dict[str, Value]] = {}
         self.assigned_first: dict[tuple[Statement, ...], dict[str, Value]] = {}
@@ -522,6 +523,31 @@ class Scope:
         found = self.discrete.at_ticks(clock, sympy.sympify(as_number(value)))
         return sympy.Eq(found, 1) if is_condition(value) else found
 
+    def _delay(self, e: Expression, time: Expression, longest: Expression | None = None) -> Value:
+        by = self.evaluate(time)
+        # With a delay that is constant, the specification asks for no limit, and one that is given says nothing more.
+        changes = isinstance(by, sympy.Expr) and not _is_of_parameters(by)
+        if changes and longest is None:
+            raise ModelError(f"delay(…) with the delay {by}, which changes, needs a third argument, the longest delay")
+        limit = self.evaluate(longest) if changes and longest is not None else None
+        return self._delayed(self.evaluate(e), by, limit)
+
+    def _delayed(self, value: Value, time: Value, longest: Value) -> Value:
+        """A value, or each entry of an array, delayed."""
+        if isinstance(value, list):
+            return [self._delayed(v, time, longest) for v in value]
+        value = as_number(value)
+        if isinstance(time, int | float) and time == 0:
+            return value
+        if not isinstance(value, sympy.Expr) or (_is_of_parameters(value) and not value.has(TimeSymbol)):
+            return value
+        key = value, time, longest
+        if key not in self.delays:
+            name, within = f":delayed[{len(self.delays)}]", self.kept.in_equations
+            by = within(time) if isinstance(time, sympy.Basic) else time
+            self.delays[key] = self.component.delayed(name, within(value), by, longest)
+        return self.delays[key]
+
 
 def _is_of_parameters(value: sympy.Expr) -> bool:
     return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols_of(value))
@@ -548,10 +574,6 @@ def located(model: str, line: int, do: Callable[..., T], *arguments: object) -> 
         raise ModelError(f"{model}, line {line}: {error}") from None
     except (TypeError, ValueError, AttributeError, IndexError, RecursionError) as error:
         raise ModelError(f"{model}, line {line}: {type(error).__name__}: {error}") from error
-
-
-def _delay(*_: Expression) -> Value:
-    raise ModelError("delay(…) needs the past of a variable, which is not kept")
 
 
 def _clocked(name: str, *_: Expression) -> Value:
