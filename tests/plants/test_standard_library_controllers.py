@@ -9,9 +9,10 @@ import pytest
 import scipy.integrate
 import scipy.signal
 from device_library import standard_library
-from open_classes import by_differences, opened, run_with_slopes
+from open_classes import along_by_differences, by_differences, opened, run_along, run_with_slopes
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
+from jaxonomy_dae.library import thermal
 from jaxonomy_dae.library.signal import Integrator
 from jaxonomy_dae.modelica import Library
 
@@ -41,6 +42,212 @@ def steady(numerator, denominator, u):
     """(A, B, C, D) of a transfer function, and its state at rest with the input u."""
     A, B, C, D = scipy.signal.tf2ss(numerator, denominator)
     return (A, B[:, 0], C[0], D[0, 0]), -np.linalg.solve(A, B[:, 0] * u)
+
+
+def test_filters_of_one_signal(library):
+    """A wave that begins late goes through filters, transfer functions and limits. Filters of SciPy begin at rest, as
+    those of the library; two of one class have other orders and kinds."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    sine = opened(library, "Blocks.Sources.Sine")(
+        ev, "sine", amplitude=1.5, f=0.4, phase=0.3, offset=0.2, startTime=0.1
+    )
+    d.add(sine)
+
+    def part(path, name, *, u="u", start=None, structure=None, **values):
+        Class = library.component(f"Modelica.Blocks.{path}", **(structure or {}))
+        x = Class(ev, name, **values, **({"start": start} if start else {}))
+        d.add(x)
+        d.connect(sine, "y", x, u)
+        return x
+
+    part(
+        "Continuous.TransferFunction", "tf", structure={"b": [2.0, 3.0], "a": [0.5, 1.2, 4.0]},
+        start={"x_scaled[1]": 0.0, "x_scaled[2]": 0.0},
+    )  # fmt: skip
+    part(
+        "Continuous.StateSpace", "ss", u="u[1]", start={"x[1]": 0.3, "x[2]": 0.0}, A=[[-0.5, 2.0], [-2.0, -0.1]],
+        B=[[1.0], [0.5]], C=[[1.0, -1.0]],
+    )  # fmt: skip
+    high = {"filterType": f"{TYPES}.FilterType.HighPass", "analogFilter": f"{TYPES}.AnalogFilter.Butterworth"}
+    waves = {"analogFilter": f"{TYPES}.AnalogFilter.Butterworth", "order": 4}
+    part("Continuous.Filter", "high", structure=high | {"order": 3}, f_cut=0.7)
+    part("Continuous.Filter", "waves", structure=waves, f_cut=0.9, gain=2.0)
+    part("Continuous.Derivative", "slope", start={"x": 0.2}, k=0.5, T=0.05)
+    part("Continuous.SecondOrder", "second", start={"y": 0.0, "yd": 0.4}, w=6.0, D=0.3)
+    part("Continuous.PID", "pid", k=2.0, Ti=0.6, Td=0.2)
+    part("Continuous.CriticalDamping", "slow", structure={"n": 3}, start={f"x[{k}]": 0.0 for k in (1, 2, 3)}, f=0.8)
+    part(
+        "Continuous.LowpassButterworth", "low", structure={"n": 3}, start={"x1[1]": 0.0, "x2[1]": 0.0, "xr": 0.0}, f=0.8
+    )
+    part("Nonlinear.SlewRateLimiter", "slew", Rising=2.0, Falling=-1.5, Td=0.02)
+    part("Continuous.LimIntegrator", "store", k=1.5, outMax=0.6, outMin=-0.3)
+    part("Math.WrapAngle", "wrap")
+    part("Math.Sign", "sign")
+    system = AcausalCompiler(ev, d)()
+    values = {
+        "sine.amplitude": 1.5, "tf.b[2]": 3.0, "tf.a[2]": 1.2, "ss.A[1,2]": 2.0, "high.f_cut": 0.7, "waves.f_cut": 0.9,
+        "slope.T": 0.05, "second.D": 0.3, "pid.Ti": 0.6, "pid.Td": 0.2, "slow.f": 0.8, "low.f": 0.8,
+        "slew.Rising": 2.0, "store.outMax": 0.6,
+    }  # fmt: skip
+    ts = np.array([0.4, 1.3, 2.0])
+    names = ["tf.y", "ss.y[1]", "high.y", "waves.y", "slope.y", "second.y", "pid.y", "slow.y", "low.y", "slew.y"]
+    names += ["store.y", "wrap.y", "sign.y"]
+    found, along = run_along(system, values, ts, names)
+
+    def reference(amplitude, b2, a2, A12, high, waves, T, D, Ti, Td, slow, low, rising, upper):
+        def wave(t):
+            return 0.2 + (amplitude * np.sin(0.8 * np.pi * (t - 0.1) + 0.3) if t >= 0.1 else 0.0)
+
+        w = 2 * np.pi * slow / np.sqrt(2 ** (1 / 3) - 1)
+        linear = [
+            ((scipy.signal.tf2ss([2.0, b2], [0.5, a2, 4.0])), None),
+            steady(*scipy.signal.butter(3, 2 * np.pi * high, "high", analog=True), 0.2),
+            steady(*scipy.signal.butter(4, 2 * np.pi * waves, analog=True), 0.2),
+            steady([0.5, 0.0], [T, 1.0], 0.2),
+            ((scipy.signal.tf2ss([w**3], np.poly([-w] * 3))), None),
+            ((scipy.signal.tf2ss(*scipy.signal.butter(3, 2 * np.pi * low, analog=True))), None),
+        ]
+        out = []
+        for (A, B, C, D_), x0 in linear:
+            B, C, D_ = np.ravel(B), np.ravel(C), np.ravel(D_)[0]
+            x = by_parts(lambda t, x, A=A, B=B: A @ x + B * wave(t), np.zeros(len(B)) if x0 is None else x0, ts, [0.1])
+            out.append(C @ x + D_ * np.array([wave(t) for t in ts]))
+        tf, high_, waves_, slope_, slow_, low_ = out
+        x = by_parts(
+            lambda t, x: [-0.5 * x[0] + A12 * x[1] + wave(t), -2 * x[0] - 0.1 * x[1] + 0.5 * wave(t)],
+            [0.3, 0.0], ts, [0.1],
+        )  # fmt: skip
+        y = by_parts(lambda t, x: [x[1], 36 * (wave(t) - x[0]) - 12 * D * x[1]], [0.0, 0.4], ts, [0.1])
+        # xi' = u/Ti, and the derivative's state, of the time constant Td/10.
+        p = by_parts(lambda t, x: [wave(t) / Ti, (wave(t) - x[1]) * 10 / Td], [0.0, 0.0], ts, [0.1])
+        u = np.array([wave(t) for t in ts])
+        pid = 2.0 * (u + p[0] + 10 * (u - p[1]))
+        fine = {"max_step": 0.002, "method": "RK45", "rtol": 1e-9}
+        slew = by_parts(lambda t, x: [np.clip((wave(t) - x[0]) / 0.02, -1.5, rising)], [0.2], ts, [0.1], **fine)[0]
+
+        # The wave rises through zero and falls, so that the store stands at its limit from when it is full.
+        def until(t, x):
+            return x[0] - upper
+
+        until.terminal = True
+        filling = scipy.integrate.solve_ivp(
+            lambda t, x: [1.5 * wave(t)], (0.1, 2.0), [0.03], "DOP853", events=until, dense_output=True, rtol=1e-11,
+            atol=1e-12,
+        )  # fmt: skip
+        turns = 0.1 + (np.pi + np.arcsin(0.2 / amplitude) - 0.3) / (0.8 * np.pi)
+        emptying = scipy.integrate.solve_ivp(
+            lambda t, x: [1.5 * wave(t)], (turns, 2.0), [upper], "DOP853", dense_output=True, rtol=1e-11, atol=1e-12
+        )
+        full = filling.t[-1]
+        store = [filling.sol(t)[0] if t < full else upper if t < turns else emptying.sol(t)[0] for t in ts]
+        return np.array([
+            tf, x[0] - x[1], high_, 2.0 * waves_, slope_, y[0], pid, slow_, low_, slew, store, u, np.sign(u)
+        ])  # fmt: skip
+
+    expected = reference(*values.values())
+    for k, n in enumerate(names):
+        np.testing.assert_allclose(found[k], expected[k], atol=1e-6, err_msg=n)
+    np.testing.assert_allclose(along, along_by_differences(reference, values), rtol=1e-4, atol=1e-4)
+
+
+def test_controllers_of_heated_bodies(library):
+    """A PID controller with limits heats our body and does not wind up; one that is on or off heats another, with a
+    timer; a signal of ours runs up and down between the limits of a hysteresis. By SciPy, and by exponentials."""
+    ev, d = EqnEnv(), AcausalDiagram()
+
+    def part(path, name, *, structure=None, **values):
+        x = library.component(f"Modelica.Blocks.{path}", **(structure or {}))(ev, name, **values)
+        d.add(x)
+        return x
+
+    wanted = part("Sources.Step", "wanted", height=25.0, offset=295.0, startTime=1.0)
+    pid = part(
+        "Continuous.LimPID", "pid", structure={"Td": 0.5}, k=20.0, Ti=4.0, yMax=400.0, yMin=0.0, xi_start=0.0,
+        xd_start=-295.0,
+    )  # fmt: skip
+    goal, switch = (
+        part("Sources.Constant", "goal", k=310.0),
+        part("Logical.OnOffController", "switch", bandwidth=2.0),
+    )
+    power, timer = part("Math.BooleanToReal", "power", realTrue=300.0, realFalse=0.0), part("Logical.Timer", "timer")
+    bodies = [thermal.HeatCapacitor(ev, f"body{k}", 50.0, T) for k, T in enumerate((295.0, 308.0))]
+    films = [thermal.ThermalConductor(ev, f"film{k}", G=5.0) for k in range(2)]
+    heaters = [thermal.HeatFlowSource(ev, f"heater{k}") for k in range(2)]
+    sensors, room = [thermal.TemperatureSensor(ev, f"sensor{k}") for k in range(2)], thermal.FixedTemperature(
+        ev, "room", 290.0
+    )  # fmt: skip
+    d.add(*bodies, *films, *heaters, *sensors, room)
+    for body, film, heater, sensor in zip(bodies, films, heaters, sensors, strict=True):
+        d.connect(body.heat, film.port_a, heater.heat, sensor.heat)
+        d.connect(film.port_b, room.heat)
+    d.connect(wanted.y, pid.u_s)
+    d.connect(sensors[0].T, pid.u_m)
+    d.connect(pid.y, heaters[0].Q_flow)
+    d.connect(goal.y, switch.reference)
+    d.connect(sensors[1].T, switch.u)
+    d.connect(switch.y, power.u, timer.u)
+    d.connect(power.y, heaters[1].Q_flow)
+    relay = part("Logical.Hysteresis", "relay", uLow=-0.5, uHigh=1.0)
+    falls, rises, chosen = (
+        part("Sources.Constant", "falls", k=-1.5),
+        part("Sources.Constant", "rises", k=1.0),
+        part("Logical.Switch", "chosen"),
+    )
+    level = Integrator(ev, "level", initial_y=0.2)
+    d.add(level)
+    d.connect(level.y, relay.u)
+    d.connect(relay.y, chosen.u2)
+    d.connect(falls.y, chosen.u1)
+    d.connect(rises.y, chosen.u3)
+    d.connect(chosen.y, level.u)
+    system = AcausalCompiler(ev, d)()
+    values = {"pid.k": 20.0, "pid.Ti": 4.0, "pid.Ni": 0.9, "pid.yMax": 400.0, "wanted.height": 25.0}
+    values |= {"switch.bandwidth": 2.0, "power.realTrue": 300.0, "relay.uLow": -0.5, "falls.k": -1.5}
+    ts = np.array([2.0, 4.5, 8.0])
+    names = ["body0.T", "pid.y", "body1.T", "timer.y", "level.y"]
+    found, along = run_along(system, values, ts, names)
+
+    def reference(k, Ti, Ni, high, height, band, heat, low, falls):
+        def controlled(t, x):
+            T, xi, xd = x
+            set_to = 295.0 + height * (t >= 1.0)
+            free = k * (set_to - T + xi + 10.0 * (-T - xd))
+            y = np.clip(free, 0.0, high)
+            change = (set_to - T + (y - free) / (k * Ni)) / Ti
+            return [(y - 5.0 * (T - 290.0)) / 50.0, change, (-T - xd) / 0.05], y
+
+        x = by_parts(
+            lambda t, x: controlled(t, x)[0], [295.0, 0.0, -295.0], ts, [1.0], method="RK45", rtol=1e-10, max_step=2e-3
+        )
+        y = [controlled(t, x)[1] for t, x in zip(ts, x.T, strict=True)]
+
+        def switched(t_end):
+            t, T, on, since = 0.0, 308.0, True, 0.0
+            while True:
+                rest = 290.0 + heat * on / 5.0
+                target = 310.0 + (band if on else -band) / 2
+                at = t - 10.0 * np.log((target - rest) / (T - rest))
+                if at >= t_end:
+                    return rest + (T - rest) * np.exp((t - t_end) / 10.0), (t_end - since) * on
+                t, T, on = at, target, not on
+                since = t if on else since
+
+        def running(t_end):
+            t, y, up = 0.0, 0.2, True
+            while True:
+                rate, target = (1.0, 1.0) if up else (falls, low)
+                at = t + (target - y) / rate
+                if at >= t_end:
+                    return y + rate * (t_end - t)
+                t, y, up = at, target, not up
+
+        return np.array([x[0], y, *np.array([switched(t) for t in ts]).T, [running(t) for t in ts]])
+
+    expected = reference(*values.values())
+    for k, n in enumerate(names):
+        np.testing.assert_allclose(found[k], expected[k], rtol=1e-6, atol=1e-6, err_msg=n)
+    # The output is 220 times a temperature, and SciPy steps over the bends of its limits.
+    np.testing.assert_allclose(along, along_by_differences(reference, values, 1e-4), rtol=1e-4, atol=1e-4)
 
 
 def test_sampled_blocks_of_a_wave(library):
