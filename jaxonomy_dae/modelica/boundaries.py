@@ -24,7 +24,7 @@ from .front_end import Flattened, FrontEnd, Unbalanced, Unrooted
 from .rumoca_expressions import SCALAR, Json
 
 MODEL = "Opened"  # of the text in which a class is opened
-_INSIDE, _RIM = "opened__", "rim__"  # the class, and its boundaries, in that model
+INSIDE, RIM = "opened__", "rim__"  # the class, and its boundaries, in that model
 
 
 class _Kind(NamedTuple):
@@ -86,7 +86,7 @@ def flattened(
     - `ModelError` as `FrontEnd.flatten`.
     """
     before = f"{source or ''}\n"
-    modified = f"{_INSIDE}({changes})" if changes else _INSIDE
+    modified = f"{INSIDE}({changes})" if changes else INSIDE
     alone, trees = _alone(front_end, name, changes, source, records)
     bounded = list(_connectors(alone.flat, "flow" if _with_semi_linear(alone.dae) else "stream"))
     bounded += [
@@ -101,15 +101,15 @@ def flattened(
         declared.append("inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false);")
     for k, top in enumerate(bounded):
         declared += _rim(k, top, variables)
-        equations.append(f"connect({_INSIDE}.{top}, {_RIM}{k}.port);")
+        equations.append(f"connect({INSIDE}.{top}, {RIM}{k}.port);")
         for n, v in variables.items():
             if n.startswith(f"{top}.") and v["stream"]:
                 stream = n[len(top) + 1 :]
-                renamed[f"{_RIM}{k}.port.{stream}"] = f"{top}.{inflow(stream)}"
+                renamed[f"{RIM}{k}.port.{stream}"] = f"{top}.{inflow(stream)}"
     for k, (n, kind) in enumerate(_inputs(alone.dae)):
-        declared.append(f"input {kind} {_RIM}u{k}{_size(n, variables)};")
-        equations.append(f"{_INSIDE}.{n} = {_RIM}u{k};")
-    roots = _roots(trees, f"{_INSIDE}.")
+        declared.append(f"input {kind} {RIM}u{k}{_size(n, variables)};")
+        equations.append(f"{INSIDE}.{n} = {RIM}u{k};")
+    roots = _roots(trees, f"{INSIDE}.")
     text = f"{before}{_model([*declared, *roots[0]], [*roots[1], *equations])}"
     return _as_alone(front_end.flatten(text, MODEL, called=name), alone, renamed)._replace(bounded=frozenset(bounded))
 
@@ -178,7 +178,7 @@ def _roots(trees: Sequence[str], inside: str) -> tuple[list[str], list[str]]:
     """Boundaries that are roots of trees, and equations that begin with them."""
     declared, equations = [], []
     for k, record in enumerate(trees):
-        rim, of, kind = f"{_RIM}r{k}", f"{inside}{record}", _kind_of(record)
+        rim, of, kind = f"{RIM}r{k}", f"{inside}{record}", _kind_of(record)
         assert kind is not None
         declared.append(f"{kind.connector} {rim};")
         root = f"{rim}{kind.ending}"
@@ -218,9 +218,9 @@ def _rim(k: int, top: str, variables: Mapping[str, Json]) -> Iterator[str]:
         declared.append(f"{prefix}Real {name}{size};")
         if not v["flow"]:
             values.append(f"port.{name} = fill(z, {size[1:-1]});" if size else f"port.{name} = z;")
-    yield f"connector {_RIM}K{k} {' '.join(declared)} end {_RIM}K{k};"
-    yield f"model {_RIM}B{k} {_RIM}K{k} port; Real z = 0; equation {' '.join(values)} end {_RIM}B{k};"
-    yield f"{_RIM}B{k} {_RIM}{k};"
+    yield f"connector {RIM}K{k} {' '.join(declared)} end {RIM}K{k};"
+    yield f"model {RIM}B{k} {RIM}K{k} port; Real z = 0; equation {' '.join(values)} end {RIM}B{k};"
+    yield f"{RIM}B{k} {RIM}{k};"
 
 
 def _size(name: str, variables: Mapping[str, Json]) -> str:
@@ -239,11 +239,11 @@ def _inputs(dae: Json) -> Iterator[tuple[str, str]]:
 def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) -> Closed:
     """A flattened model with boundaries, under the names that the class has alone."""
     names = [v["name"] for v in found.dae["storage"]["variables"]]
-    outer = frozenset(n for n in names if not n.startswith((_INSIDE, _RIM)))
+    outer = frozenset(n for n in names if not n.startswith((INSIDE, RIM)))
 
     def under_own_names(of: Json, also: Mapping[str, str]) -> Json:
         # As text, since names stand in many lists of these records.
-        text = json.dumps(of).replace(f'"{_INSIDE}.', '"')
+        text = json.dumps(of).replace(f'"{INSIDE}.', '"')
         for before, after in also.items():
             text = text.replace(f'"{before}"', f'"{after}"')
         return json.loads(text)
@@ -251,7 +251,7 @@ def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) ->
     dae, told = under_own_names(found.dae, renamed), under_own_names(found.flat, {})
     flat: dict[str, Any] = {
         **told,
-        "top_level_connectors": [n for n in alone.flat["top_level_connectors"] if not n.startswith(_RIM)],
+        "top_level_connectors": [n for n in alone.flat["top_level_connectors"] if not n.startswith(RIM)],
         "model_description": alone.flat.get("model_description"),
     }
     for n, v in flat["variables"].items():
@@ -272,15 +272,15 @@ def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) ->
 
 def _edges(flat: Json) -> tuple[tuple[str, str], ...]:
     """The edges of trees that a class has inside."""
-    return tuple((a, b) for a, b in (*flat["branches"], *flat["optional_edges"]) if not a.startswith(_RIM))
+    return tuple((a, b) for a, b in (*flat["branches"], *flat["optional_edges"]) if not a.startswith(RIM))
 
 
 def without_boundaries(model: FlatModel, outer: frozenset[str]) -> FlatModel:
     """The model without what reads variables of boundaries, and without the variables of outer components that no
     equation of the class reads."""
     own = model.model
-    equations = [(e, set(_names(e))) for e in own.equations]
-    kept = [(e, names) for e, names in equations if not any(n.startswith(_RIM) for n in names)]
+    equations = [(e, set(_names(e))) for e in map(_without_rim, own.equations) if e is not None]
+    kept = [(e, names) for e, names in equations if not any(n.startswith(RIM) for n in names)]
     parameters = {d.name for d in own.declarations if d.prefixes & {"parameter", "constant"}}
     around = {n for d in own.declarations for n in [re.sub(r"\[[\d,]+\]$", "", d.name)] if n in outer} - parameters
     around -= {re.sub(r"\[[\d,]+\]$", "", n) for n in parameters}
@@ -294,15 +294,23 @@ def without_boundaries(model: FlatModel, outer: frozenset[str]) -> FlatModel:
     chosen = {id(e) for e, _ in mine}
     gone = around - read
     declarations = tuple(
-        d for d in own.declarations if not d.name.startswith(_RIM) and re.sub(r"\[[\d,]+\]$", "", d.name) not in gone
+        d for d in own.declarations if not d.name.startswith(RIM) and re.sub(r"\[[\d,]+\]$", "", d.name) not in gone
     )
-    initial = tuple(e for e in own.initial_equations if not any(n.startswith(_RIM) or n in gone for n in _names(e)))
+    initial = tuple(e for e in own.initial_equations if not any(n.startswith(RIM) or n in gone for n in _names(e)))
     left = own._replace(
         declarations=declarations,
-        equations=tuple(e for e in own.equations if id(e) in chosen),
+        equations=tuple(e for e, _ in equations if id(e) in chosen),
         initial_equations=initial,
     )
     return dataclasses.replace(model, model=left)
+
+
+def _without_rim(e: tree.Statement) -> tree.Statement | None:
+    """A `when` without what it does to boundaries; None if nothing is left of it."""
+    if not isinstance(e, tree.Branches) or e.kind != "when":
+        return e
+    bodies = [(c, tuple(s for s in body if not any(n.startswith(RIM) for n in _names(s)))) for c, body in e.branches]
+    return e._replace(branches=tuple(bodies)) if any(body for _, body in bodies) else None
 
 
 def _names(e: Any) -> Iterator[str]:

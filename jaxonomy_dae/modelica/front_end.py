@@ -23,6 +23,10 @@ _UNROOTED = re.compile(
 _DECIDES = re.compile(
     r"not parameter-evaluable: unknown variable: ([\w.]+)|unresolved component dimension for [\w.]+: (\w+)"
 )
+_UNCLOCKED = re.compile(
+    r"unresolved clock schedule|no exact connected clock owner|no inferred clock constructor"
+    r"|must belong to a proven clock partition|the required exact clock owner|requires an owning clocked when-clause"
+)
 _NOT_LOADED = re.compile(r"Failed to load source root")
 _CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")
 
@@ -41,6 +45,10 @@ class Unbalanced(ModelError):
     def __init__(self, message: str, missing: int):
         super().__init__(message)
         self.missing = missing
+
+
+class Unclocked(ModelError):
+    """Nothing in a model says when a clock ticks."""
 
 
 class Flattened(NamedTuple):
@@ -88,7 +96,7 @@ class FrontEnd:
                 ) from None
             if counts := _UNBALANCED.search(str(error)):
                 raise Unbalanced(said, int(counts[2]) - int(counts[1])) from None
-            raise ModelError(said) from None
+            raise (Unclocked if _UNCLOCKED.search(str(error)) else ModelError)(said) from None
         except BaseException as error:
             if type(error).__name__ != "PanicException":  # of a Rust library: no Exception, and not importable
                 raise

@@ -14,8 +14,12 @@ from . import tree
 from .boundaries import Closed, without_boundaries
 from .external_objects import with_external_objects
 from .flat_model import FlatModel
+from .held_outputs import with_held_outputs
+from .kept_inputs import with_starts_of_inputs
+from .model_algorithms import with_algorithms
 from .read_rumoca import read_open
 from .rumoca_expressions import Json
+from .sources import Sources
 
 AS_TEXT = (
     "a part of a model that has such connectors inside opens as a whole: write it as a Modelica text with plain "
@@ -67,8 +71,8 @@ class OpenClass:
     roots: tuple[str, ...] = ()
 
 
-def opened(name: str, closed: Closed) -> OpenClass:
-    """A class with open connectors, from its flattening.
+def opened(name: str, closed: Closed, sources: Sources) -> OpenClass:
+    """A class with open connectors, from its flattening and the libraries that it belongs to.
 
     **Raises:**
 
@@ -83,8 +87,10 @@ def opened(name: str, closed: Closed) -> OpenClass:
     loose = [p for p in ports if not {p.name, re.sub(r"\[[\d,]+\]$", "", p.name)} & closed.bounded]
     flows = [f"{port.name}.{flow}" for port in loose for flow, _ in port.flows]
     flat = with_external_objects(read_open(found.dae, name.rpartition(".")[2], flows), found.flat)
-    flat = without_boundaries(flat, closed.outer)
+    flat = with_starts_of_inputs(with_algorithms(without_boundaries(flat, closed.outer), sources))
     storage = found.dae["storage"]
+    given = [v["name"] for v in storage["variables"] if v["attributes"]["causality"] == "output"]
+    flat = with_held_outputs(flat, [n for n in given if "." not in n])
     tunable, required, fixed = [], [], []
     roles: dict[str, list[str]] = {"input": [], "output": []}
     declared = {d.name: d for d in flat.model.declarations}

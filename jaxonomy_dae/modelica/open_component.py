@@ -75,19 +75,10 @@ class OpenComponent(FlatComponent):
         discrete = [n for n in of.outputs if types[n] != "Real"]
         flat = type(flat)(model, flat.classes)
         signals = {n for n in of.inputs if types[n] != "Real"}
-        constant = _numbers(of, numbers, where)
-        scope = Scope(flat, self, constant, given, signals)
-        # Inputs follow variables: an output that is constant between events is a variable that follows what is held.
-        held = {n: f"{n}:held" for n in of.outputs if n in scope.definitions.stored}
-        if held:
-            flat = type(flat)(_renamed(model, held), flat.classes)
-            scope = Scope(flat, self, constant, given, signals)
-            discrete = [n for n in discrete if n not in held]
+        scope = Scope(flat, self, _numbers(of, numbers, where), given, signals)
         # Starts refer to parameters that the text does not declare.
         scope.known |= {n: v for n, v in given.items() if n not in declared}
         self._write(flat, scope, discrete)
-        for n, kept in held.items():
-            self.output(n, self.symbol(kept))
         self._show_ports()
 
     def variable(self, name: str, **declared: Any) -> VariableSymbol:
@@ -105,21 +96,6 @@ class OpenComponent(FlatComponent):
         for top, ports in nested.items():
             if top not in self.__dict__:
                 object.__setattr__(self, top, ports[0] if ports[0].name == top else tuple(ports))
-
-
-def _renamed(e: Any, names: Mapping[str, str]) -> Any:
-    """A part of a model in which some variables have other names."""
-    if isinstance(e, Mapping):
-        return {k: _renamed(v, names) for k, v in e.items()}
-    if not isinstance(e, tuple):
-        return e
-    parts = [_renamed(part, names) for part in e]
-    if not hasattr(e, "_fields"):
-        return tuple(parts)
-    new = type(e)(*parts)
-    if isinstance(new, Reference):
-        return new._replace(parts=(names.get(new.parts[0], new.parts[0]), *new.parts[1:]))
-    return new._replace(name=names.get(new.name, new.name)) if isinstance(new, Declaration) else new
 
 
 def _with_start(d: Declaration, start: Expression) -> Declaration:

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
+BUILT_IN = ("Real", "Integer", "Boolean", "String")
+
 
 class Number(NamedTuple):
     """A literal: `value` is a float, or an int where the text has neither point nor exponent."""

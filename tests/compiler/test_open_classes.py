@@ -1,6 +1,7 @@
 """Modelica classes become classes of components with open ports. NumPy only."""
 
 import csv
+import functools
 import json
 import re
 import zipfile
@@ -288,7 +289,7 @@ def test_classes_are_data(library, tmp_path):
         packed.component("Devices.Load", m=2)
     with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
         archive.writestr("A.json", json.dumps({"format": 0}))
-    with pytest.raises(ModelError, match=r"this is no class of format 5: it has format 0"):
+    with pytest.raises(ModelError, match=r"this is no class of format 6: it has format 0"):
         Library(tmp_path / "c.zip")["A"]
     (tmp_path / "d.zip").write_bytes(b"none")
     with pytest.raises(ModelError, match=r"'.*d.zip' is not a file of packed classes"):
@@ -453,12 +454,19 @@ def test_equations_of_complex_numbers_are_two_of_real_ones(text, tmp_path):
         assert eval(python, names) == pytest.approx(value, rel=1e-13), name
 
 
-def test_connections_of_arrays_of_boolean_connectors_are_loops(tmp_path):
+def test_connections_of_discrete_connectors_are_equations(tmp_path):
     source = """package Bank
+  type Level = enumeration(low, high);
   connector Signal = input Boolean;
+  connector LevelIn = input Level;
+  connector LevelOut = output Level;
   model Switch
     Signal on;
   end Switch;
+  model Gate
+    LevelIn x;
+    LevelOut y;
+  end Gate;
   model Group
     Signal on[2];
   end Group;
@@ -467,7 +475,12 @@ def test_connections_of_arrays_of_boolean_connectors_are_loops(tmp_path):
     Signal on[m];
     Switch switch[m];
     Group group, other;
+    LevelOut level;
+    Gate first, second, third if m > 2;
   equation
+    connect(first.y, second.x);
+    connect(level, second.y);
+    connect(first.y, third.x);
     connect(on, switch.on);
     connect(on[1], switch[1].on);
     connect(group.on, other.on);
@@ -476,9 +489,16 @@ end Bank;
 """
     (tmp_path / "Bank.mo").write_text(source)
     new = with_single_connections(Sources([tmp_path]), source)
-    loop = "for k__ in 1:m loop connect(on[k__], switch[k__].on); end for;"
-    other = "for k__ in 1:size(group.on, 1) loop connect(group.on[k__], other.on[k__]); end for;"
-    expected = source.replace("connect(on, switch.on);", loop).replace("connect(group.on, other.on);", other)
+    changes = {
+        "connect(on, switch.on)": "for k__ in 1:m loop switch[k__].on = on[k__]; end for",
+        "connect(on[1], switch[1].on)": "switch[1].on = on[1]",
+        # Nothing says here which of two inputs of parts is given.
+        "connect(group.on, other.on)": "for k__ in 1:size(group.on, 1) loop connect(group.on[k__], other.on[k__]); "
+        "end for",
+        "connect(first.y, second.x)": "second.x = first.y",
+        "connect(level, second.y)": "level = second.y",
+    }
+    expected = functools.reduce(lambda text, change: text.replace(*change), changes.items(), source)
     assert new == expected
 
 
@@ -521,8 +541,12 @@ end Logic;
 """
     (tmp_path / "Logic.mo").write_text(source)
     new = with_single_connections(Sources([tmp_path]), source)
-    expected = source.replace("connect(s, first.a)", "first.a = s").replace("connect(second.b, r)", "second.b = r")
-    assert new == expected
+    made = {
+        "connect(s, first.a)": "first.a = s", "connect(second.b, r)": "second.b = r",
+        "connect(second.y, first.b)": "first.b = second.y", "connect(first.y, late.u)": "late.u = first.y",
+        "connect(late.y, second.a)": "second.a = late.y", "connect(second.y, q)": "q = second.y",
+    }  # fmt: skip
+    assert new == functools.reduce(lambda text, change: text.replace(*change), made.items(), source)
     assert Library(tmp_path)["Logic.Keeps"].opened.inputs == ("s", "r")
 
 

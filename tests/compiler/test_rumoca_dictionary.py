@@ -3,6 +3,7 @@
 import copy
 
 import pytest
+import sympy
 from modelica_sources import BALL, SOURCES, stored, without_places
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
@@ -174,3 +175,26 @@ def test_sources_from_elsewhere(tmp_path):
         load(file, "Plant.Broken")
     with pytest.raises(ModelError, match=r"line 8: delay\(…\) needs the past"):
         FlatComponent(EqnEnv(), "m", load(file, "Plant.Late"))
+
+
+def test_ranges_that_fall_and_the_order_of_iterators():
+    """All values of 3:-1:1 count, the last iterator counts the rows (Modelica Language Specification 3.6, section
+    10.4.1.1), and a function of scalars is applied to the entries of arrays (section 12.4.6)."""
+    source = """package P
+  function square input Real u; output Real y; algorithm y := u * u; end square;
+  function rows input Real u; output Real y[2, 2]; algorithm y := {i + 10 * j * u for i in 1:2, j in 1:2}; end rows;
+  model M
+    Real a[3], b[2], c[2, 2], d;
+  equation
+    for i in 3:-1:1 loop a[i] = i * time; end for;
+    b = square({time, 2 * time});
+    c = rows(time);
+    d = sum({10 * time * k for k in 3:-2:1});
+  end M;
+end P;
+"""
+    c = FlatComponent(EqnEnv(), "m", load(source, "P.M"))
+    found = {str(s): v for e in c.equations for s, v in sympy.solve(e.subs(c.ev.t, 1), dict=True)[0].items()}
+    assert [found[f"a[{k}]"] for k in (1, 2, 3)] == [1, 2, 3]
+    assert [found["b[1]"], found["b[2]"], found["d"]] == [1, 4, 40]
+    assert [found[f"c[{i},{j}]"] for i in (1, 2) for j in (1, 2)] == [11, 12, 21, 22]

@@ -48,6 +48,7 @@ from .step_sizes import clipped, controller_for, scaled_atol
 FEW_NUMBERS = 20_000  # on one side of all events: up to so many, states before and after events are kept (160 kB)
 ROOM = 100  # events that the log of a first run has room for; a run with more is made again with room for all
 MOST_EVENTS = 2**7 * ROOM  # of a run, if the user does not say: with a few steps each, near the default max_steps
+MOST_TICKS = 2**24  # counted in addition to `max_steps`: days of running
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
 
 
@@ -134,8 +135,9 @@ def simulate(
     - `control`: variables whose errors count in addition to those of the states, such as a pressure that depends on a
         mass by a large factor. When a solution is read, a warning names variables that amplify the tolerance of a
         state.
-    - `max_steps`: the largest number of steps, without those that end at samples. With `ts=None`, this many rows are
-        reserved.
+    - `max_steps`: the largest number of steps, without those that end at samples or at ticks of clocks. With `ts=None`,
+        this many rows are reserved. Ticks are counted where periods and the length of the run are known, not inside jit
+        where they are traced.
     - `max_events`: the largest number of events of conditions, which is also the room in `solution.events`. None:
         12,800 events. Outside jit, grad and vmap, the room starts at 100 events, and the run is repeated with twice the
         room until all fit. Inside, the first 100 are listed. Switches of relations in equations are not listed.
@@ -201,6 +203,7 @@ def simulate(
         )
     scaled = scaled_atol(system, atol)
     chosen, tolerances = (None, None) if prescribed else (comparable(solver), (rtol, scaled))
+    duration = None if is_traced((t0, t1)) else float(t1) - float(t0)
     asked = Asked(jump_ts, dtmax, max_steps, chosen, tuple(control), tolerances, throw is not False)
     call = _Call(
         system=system,
@@ -212,6 +215,7 @@ def simulate(
         atol=atol,
         scaled=scaled,
         ends=step_ends(system.plan, read),
+        ticks=_ticks(system, duration),
         adjoint=adjoint,
         controller=stepsize_controller,
         max_events=max_events,
@@ -219,7 +223,7 @@ def simulate(
         progress=progress,
         throw=throw,
         known=not is_traced((given, adjoint, stepsize_controller)),
-        duration=None if is_traced((t0, t1)) else float(t1) - float(t0),
+        duration=duration,
         asked=asked,
     )
     # A solver of the user's may hold what is traced, as the tolerance of its root finder.
@@ -259,6 +263,7 @@ class _Call:
     atol: Tolerance
     scaled: Tolerance  # atol of each entry of the state
     ends: StepEnds
+    ticks: int
     adjoint: diffrax.AbstractAdjoint | None
     controller: Controller
     max_events: int | None
@@ -301,7 +306,8 @@ class _Call:
             adjoint = default_adjoint(self.given, batch_size(self.given), self.known)
         return Options(
             solver=solver, adjoint=adjoint, controller=clipped(steps, asked.jump_ts, self.ends),
-            max_steps=asked.max_steps + self.ends.count, progress=self.progress, max_events=self.bounds[1], room=room,
+            max_steps=asked.max_steps + self.ends.count + self.ticks, progress=self.progress,
+            max_events=self.bounds[1], room=room,
             save_events=few and self.known if self.save_events is None else self.save_events,
         )  # fmt: skip
 
@@ -428,15 +434,30 @@ class _Call:
         return SimulationError(explain(solution, stopped, outcome.found.x, is_implicit(self.run_by), events))
 
 
+def _clocks(system: AcausalSystem) -> set[tuple[float, float]]:
+    """The different periods and offsets of clocks; none where they are not known."""
+    events = system.plan.events
+    if events is None or not events.n_clocks:
+        return set()
+    periods, offsets = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes).clocks()
+    if is_traced((periods, offsets)):
+        return set()
+    return set(zip(np.asarray(periods).tolist(), np.asarray(offsets).tolist(), strict=True))
+
+
+def _ticks(system: AcausalSystem, duration: float | None) -> int:
+    """The ticks of clocks in a run, each of which ends a step."""
+    ticks = 0.0 if duration is None else sum(duration / period for period, _ in _clocks(system) if period > 0)
+    return _room_for(min(ticks, MOST_TICKS)) if ticks else 0
+
+
 def _expected_events(system: AcausalSystem, duration: float) -> float:
     """The events that a model with clocks has, if each of its conditions comes true once in every shortest period: so
     the log of the first run has room for them, and no second program with a larger one is compiled."""
-    events = system.plan.events
-    if events is None or not events.n_clocks:
+    clocks, events = _clocks(system), system.plan.events
+    if not clocks or events is None:
         return 0.0
-    at = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes)
-    shortest = float(np.min(np.asarray(at.clocks()[0])))
-    return min(duration / shortest * len(events), MOST_EVENTS)
+    return min(duration / min(period for period, _ in clocks) * len(events), MOST_EVENTS)
 
 
 def _room_for(events: float) -> int:

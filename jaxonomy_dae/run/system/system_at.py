@@ -28,7 +28,7 @@ from ...solve.linear.arrays import Numbers
 from ...solve.linear.once import stacked_in_batches
 from ...solve.linear.sparse import SparsePattern, sparse_jacobian
 from ...solve.linear.whole import solve_whole
-from ...solve.linear.written_out import UNROLLED, solve
+from ...solve.linear.written_out import UNROLLED_POSITIVE, solve
 from ...solve.methods.field_size import is_large
 from .evaluate import Evaluation
 from .input_values import input_values
@@ -331,7 +331,7 @@ class SystemAt:
     def _least_norm_step(self, x: Array) -> Array:
         plan = self.plan
         n = len(plan.states)
-        if plan.n_state <= SCALARS and plan.n_constraints <= UNROLLED and plan.held is None:
+        if plan.n_state <= SCALARS and plan.n_constraints <= UNROLLED_POSITIVE and plan.held is None:
             return self._least_norm_of_few(self._chunk(x))
         nominal = jnp.asarray(plan.nominal[:n], self.dtype)
         # Rows by reverse mode: there are fewer constraints than states.
@@ -348,7 +348,7 @@ class SystemAt:
         gram = jacobian @ jacobian.T
         gram = gram if absent is None else gram + jnp.diag(absent)
         # LAPACK apart, for few: with a matrix that turns out to be constant, XLA does not find it (jaxlib 0.10.2).
-        small = len(value) <= UNROLLED
+        small = len(value) <= UNROLLED_POSITIVE
         multiplier = (
             jnp.stack(solve([[*row] for row in gram], [*value], positive=True))
             if small
