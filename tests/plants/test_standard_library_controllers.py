@@ -17,7 +17,6 @@ from jaxonomy_dae.library.signal import Integrator
 from jaxonomy_dae.modelica import Library
 
 pytestmark = pytest.mark.slow
-TYPES = "Modelica.Blocks.Types"
 
 
 @pytest.fixture(scope="module")
@@ -36,118 +35,6 @@ def by_parts(slope, start, ts, breaks=(), **options):
         rows.append(run.y[:, : len(inside)])
         t, x = end, run.y[:, -1]
     return np.concatenate(rows, axis=1)
-
-
-def steady(numerator, denominator, u):
-    """(A, B, C, D) of a transfer function, and its state at rest with the input u."""
-    A, B, C, D = scipy.signal.tf2ss(numerator, denominator)
-    return (A, B[:, 0], C[0], D[0, 0]), -np.linalg.solve(A, B[:, 0] * u)
-
-
-def test_filters_of_one_signal(library):
-    """A wave that begins late goes through filters, transfer functions and limits. Filters of SciPy begin at rest, as
-    those of the library; two of one class have other orders and kinds."""
-    ev, d = EqnEnv(), AcausalDiagram()
-    sine = opened(library, "Blocks.Sources.Sine")(
-        ev, "sine", amplitude=1.5, f=0.4, phase=0.3, offset=0.2, startTime=0.1
-    )
-    d.add(sine)
-
-    def part(path, name, *, u="u", start=None, structure=None, **values):
-        Class = library.component(f"Modelica.Blocks.{path}", **(structure or {}))
-        x = Class(ev, name, **values, **({"start": start} if start else {}))
-        d.add(x)
-        d.connect(sine, "y", x, u)
-        return x
-
-    part(
-        "Continuous.TransferFunction", "tf", structure={"b": [2.0, 3.0], "a": [0.5, 1.2, 4.0]},
-        start={"x_scaled[1]": 0.0, "x_scaled[2]": 0.0},
-    )  # fmt: skip
-    part(
-        "Continuous.StateSpace", "ss", u="u[1]", start={"x[1]": 0.3, "x[2]": 0.0}, A=[[-0.5, 2.0], [-2.0, -0.1]],
-        B=[[1.0], [0.5]], C=[[1.0, -1.0]],
-    )  # fmt: skip
-    high = {"filterType": f"{TYPES}.FilterType.HighPass", "analogFilter": f"{TYPES}.AnalogFilter.Butterworth"}
-    waves = {"analogFilter": f"{TYPES}.AnalogFilter.Butterworth", "order": 4}
-    part("Continuous.Filter", "high", structure=high | {"order": 3}, f_cut=0.7)
-    part("Continuous.Filter", "waves", structure=waves, f_cut=0.9, gain=2.0)
-    part("Continuous.Derivative", "slope", start={"x": 0.2}, k=0.5, T=0.05)
-    part("Continuous.SecondOrder", "second", start={"y": 0.0, "yd": 0.4}, w=6.0, D=0.3)
-    part("Continuous.PID", "pid", k=2.0, Ti=0.6, Td=0.2)
-    part("Continuous.CriticalDamping", "slow", structure={"n": 3}, start={f"x[{k}]": 0.0 for k in (1, 2, 3)}, f=0.8)
-    part(
-        "Continuous.LowpassButterworth", "low", structure={"n": 3}, start={"x1[1]": 0.0, "x2[1]": 0.0, "xr": 0.0}, f=0.8
-    )
-    part("Nonlinear.SlewRateLimiter", "slew", Rising=2.0, Falling=-1.5, Td=0.02)
-    part("Continuous.LimIntegrator", "store", k=1.5, outMax=0.6, outMin=-0.3)
-    part("Math.WrapAngle", "wrap")
-    part("Math.Sign", "sign")
-    system = AcausalCompiler(ev, d)()
-    values = {
-        "sine.amplitude": 1.5, "tf.b[2]": 3.0, "tf.a[2]": 1.2, "ss.A[1,2]": 2.0, "high.f_cut": 0.7, "waves.f_cut": 0.9,
-        "slope.T": 0.05, "second.D": 0.3, "pid.Ti": 0.6, "pid.Td": 0.2, "slow.f": 0.8, "low.f": 0.8,
-        "slew.Rising": 2.0, "store.outMax": 0.6,
-    }  # fmt: skip
-    ts = np.array([0.4, 1.3, 2.0])
-    names = ["tf.y", "ss.y[1]", "high.y", "waves.y", "slope.y", "second.y", "pid.y", "slow.y", "low.y", "slew.y"]
-    names += ["store.y", "wrap.y", "sign.y"]
-    found, along = run_along(system, values, ts, names)
-
-    def reference(amplitude, b2, a2, A12, high, waves, T, D, Ti, Td, slow, low, rising, upper):
-        def wave(t):
-            return 0.2 + (amplitude * np.sin(0.8 * np.pi * (t - 0.1) + 0.3) if t >= 0.1 else 0.0)
-
-        w = 2 * np.pi * slow / np.sqrt(2 ** (1 / 3) - 1)
-        linear = [
-            ((scipy.signal.tf2ss([2.0, b2], [0.5, a2, 4.0])), None),
-            steady(*scipy.signal.butter(3, 2 * np.pi * high, "high", analog=True), 0.2),
-            steady(*scipy.signal.butter(4, 2 * np.pi * waves, analog=True), 0.2),
-            steady([0.5, 0.0], [T, 1.0], 0.2),
-            ((scipy.signal.tf2ss([w**3], np.poly([-w] * 3))), None),
-            ((scipy.signal.tf2ss(*scipy.signal.butter(3, 2 * np.pi * low, analog=True))), None),
-        ]
-        out = []
-        for (A, B, C, D_), x0 in linear:
-            B, C, D_ = np.ravel(B), np.ravel(C), np.ravel(D_)[0]
-            x = by_parts(lambda t, x, A=A, B=B: A @ x + B * wave(t), np.zeros(len(B)) if x0 is None else x0, ts, [0.1])
-            out.append(C @ x + D_ * np.array([wave(t) for t in ts]))
-        tf, high_, waves_, slope_, slow_, low_ = out
-        x = by_parts(
-            lambda t, x: [-0.5 * x[0] + A12 * x[1] + wave(t), -2 * x[0] - 0.1 * x[1] + 0.5 * wave(t)],
-            [0.3, 0.0], ts, [0.1],
-        )  # fmt: skip
-        y = by_parts(lambda t, x: [x[1], 36 * (wave(t) - x[0]) - 12 * D * x[1]], [0.0, 0.4], ts, [0.1])
-        # xi' = u/Ti, and the derivative's state, of the time constant Td/10.
-        p = by_parts(lambda t, x: [wave(t) / Ti, (wave(t) - x[1]) * 10 / Td], [0.0, 0.0], ts, [0.1])
-        u = np.array([wave(t) for t in ts])
-        pid = 2.0 * (u + p[0] + 10 * (u - p[1]))
-        fine = {"max_step": 0.002, "method": "RK45", "rtol": 1e-9}
-        slew = by_parts(lambda t, x: [np.clip((wave(t) - x[0]) / 0.02, -1.5, rising)], [0.2], ts, [0.1], **fine)[0]
-
-        # The wave rises through zero and falls, so that the store stands at its limit from when it is full.
-        def until(t, x):
-            return x[0] - upper
-
-        until.terminal = True
-        filling = scipy.integrate.solve_ivp(
-            lambda t, x: [1.5 * wave(t)], (0.1, 2.0), [0.03], "DOP853", events=until, dense_output=True, rtol=1e-11,
-            atol=1e-12,
-        )  # fmt: skip
-        turns = 0.1 + (np.pi + np.arcsin(0.2 / amplitude) - 0.3) / (0.8 * np.pi)
-        emptying = scipy.integrate.solve_ivp(
-            lambda t, x: [1.5 * wave(t)], (turns, 2.0), [upper], "DOP853", dense_output=True, rtol=1e-11, atol=1e-12
-        )
-        full = filling.t[-1]
-        store = [filling.sol(t)[0] if t < full else upper if t < turns else emptying.sol(t)[0] for t in ts]
-        return np.array([
-            tf, x[0] - x[1], high_, 2.0 * waves_, slope_, y[0], pid, slow_, low_, slew, store, u, np.sign(u)
-        ])  # fmt: skip
-
-    expected = reference(*values.values())
-    for k, n in enumerate(names):
-        np.testing.assert_allclose(found[k], expected[k], atol=1e-6, err_msg=n)
-    np.testing.assert_allclose(along, along_by_differences(reference, values), rtol=1e-4, atol=1e-4)
 
 
 def test_controllers_of_heated_bodies(library):
