@@ -1,4 +1,4 @@
-"""Blocks of the Modelica Standard Library 4.1.0 that filter, limit, sample and decide, around our own plants.
+"""Blocks of the Modelica Standard Library 4.1.0 that limit, sample and decide, around our own plants.
 
 Each stands beside its equations in SciPy, or beside its closed form; slopes are those of central differences.
 `MODELICA_LIBRARY` names the folder of the library; without it the tests are skipped.
