@@ -4,6 +4,7 @@ Each stands beside its equations in SciPy; slopes are those of central differenc
 of the library; without it the tests are skipped.
 """
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
@@ -12,10 +13,11 @@ from device_library import standard_library
 from diode_bridges import GOFF, RON, bridge_by_brute_force
 from open_classes import by_differences, opened, run_with_slopes
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
-from jaxonomy_dae.library import electrical, rotational
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae.library import electrical, rotational, thermal
 from jaxonomy_dae.library.signal import Ramp
 from jaxonomy_dae.modelica import Library
+from jaxonomy_dae.solvers import Rodas5P
 
 pytestmark = pytest.mark.slow
 MACHINES = "Electrical.Machines.BasicMachines"
@@ -31,6 +33,87 @@ def solved(slope, start, ts, **options):
     run = scipy.integrate.solve_ivp(slope, (0.0, ts[-1]), start, t_eval=ts, **given)
     assert run.success
     return run.y
+
+
+def test_motors_of_a_watt_and_of_a_megawatt(library):
+    """Two motors of one class: a small one with losses of brushes, core, stray fields and friction, whose winding heats
+    our body and loses conductance, and a large one without losses. Both turn our loads."""
+    ev, d = EqnEnv(), AcausalDiagram()
+    name = f"Modelica.{MACHINES}.DCMachines.DC_PermanentMagnet"
+    losses = {"coreParameters": {"PRef": 0.3}, "strayLoadParameters": {"PRef": 0.1}}
+    losses |= {"frictionParameters": {"PRef": 0.2}, "brushParameters": {"V": 0.4}}
+    Small = library.component(name, useThermalPort=True, **losses)
+    reference = {"TaNominal": 293.15, "TaRef": 293.15}
+    small = Small(
+        ev, "small", VaNominal=12.0, IaNominal=0.5, wNominal=300.0, Ra=3.0, La=2e-3, Jr=1e-5, alpha20a=3.93e-3,
+        TaOperational=293.15, start={"la.i": 0.0}, **reference,
+    )  # fmt: skip
+    large = opened(library, f"{MACHINES}.DCMachines.DC_PermanentMagnet")(
+        ev, "large", VaNominal=1000.0, IaNominal=1000.0, wNominal=150.0, Ra=0.02, La=5e-4, Jr=40.0, alpha20a=0.0,
+        TaOperational=293.15, start={"la.i": 0.0}, **reference,
+    )  # fmt: skip
+    weak, strong, g = (
+        electrical.VoltageSource(ev, "weak", V=12.0),
+        electrical.VoltageSource(ev, "strong", V=900.0),
+        electrical.Ground(ev, "g"),
+    )
+    fan = rotational.Inertia(ev, "fan", J=2e-5, initial_angle=0.0, initial_speed=0.0)
+    mill = rotational.Inertia(ev, "mill", J=200.0, initial_angle=0.0, initial_speed=0.0)
+    air, rock, wall = (
+        rotational.Damper(ev, "air", d=1e-5),
+        rotational.Damper(ev, "rock", d=30.0),
+        rotational.FixedAngle(ev, "wall"),
+    )
+    winding, rest = thermal.HeatCapacitor(ev, "winding", 0.5, 293.15), thermal.FixedTemperature(ev, "rest", 293.15)
+    case = thermal.ThermalConductor(ev, "case", G=0.02)
+    d.add(small, large, weak, strong, g, fan, mill, air, rock, wall, winding, rest, case)
+    d.connect(weak.p, small.pin_ap)
+    d.connect(strong.p, large.pin_ap)
+    d.connect(g.p, weak.n, strong.n, small.pin_an, large.pin_an)
+    d.connect(small.flange, fan.flange_a, air.flange_a)
+    d.connect(large.flange, mill.flange_a, rock.flange_a)
+    d.connect(wall.flange, air.flange_b, rock.flange_b)
+    ports = {p.name.rpartition(".")[2]: p for p in small.thermalPort}
+    d.connect(ports.pop("heatPortArmature"), winding.heat, case.port_a)
+    d.connect(rest.heat, case.port_b, *ports.values())
+    system = AcausalCompiler(ev, d)()
+    values = {
+        "small.Ra": 3.0, "small.brushParameters.V": 0.4, "small.coreParameters.PRef": 0.3, "case.G": 0.02,
+        "fan.J": 2e-5, "large.La": 5e-4, "large.Jr": 40.0, "rock.d": 30.0,
+    }  # fmt: skip
+    ts = np.array([0.02, 0.1, 0.4])
+    names = ["fan.w", "winding.T", "small.pin_ap.i", "mill.w", "large.pin_ap.i"]
+    given = system.with_parameters(values)
+    found = simulate(given, 0.4, ts=jnp.asarray(ts), rtol=1e-9, atol=1e-11, solver=Rodas5P())[names].T
+
+    def motors(Ra, brush, core, G, J, La, Jr, rock):
+        induced = 12.0 - Ra * 0.5 - brush
+        k, Gc, linear = induced / 300.0, core / induced**2, 0.005
+
+        def current(T, i):
+            """Of the pin, with that of the winding's inductance; and the voltage behind the resistance and brushes."""
+            R = Ra * (1 + 3.93e-3 * (T - 293.15))
+            high = (i + Gc * (12.0 - brush)) / (1 + Gc * R)
+            low = (i + Gc * 12.0) / (1 + Gc * (R + brush / linear))
+            now, drop = (high, brush) if high > linear else (low, brush * low / linear)
+            return R, now, 12.0 - R * now - drop
+
+        def slope(t, x):
+            i, w, T = x
+            R, now, across = current(T, i)
+            friction = 0.2 / 300.0 * ((w / 300.0) ** 2 if w > 0.3 else 1e-6 * w / 0.3)
+            stray = 0.1 / 300.0 * (now / 0.5) ** 2 * abs(w) / 300.0 * np.sign(w)
+            torque = k * i - friction - stray - 1e-5 * w
+            return [(across - k * w) / 2e-3, torque / (1e-5 + J), (R * now**2 - G * (T - 293.15)) / 0.5]
+
+        x = solved(slope, [0.0, 0.0, 293.15], ts, method="Radau", rtol=1e-10, atol=1e-12, max_step=1e-3)
+        pin = [current(T, i)[1] for i, _, T in x.T]
+        k = 980.0 / 150.0
+        y = solved(lambda t, y: [(900.0 - 0.02 * y[0] - k * y[1]) / La, (k * y[0] - rock * y[1]) / (Jr + 200.0)],
+                   [0.0, 0.0], ts)  # fmt: skip
+        return np.array([x[1], x[2], pin, y[1], y[0]])
+
+    np.testing.assert_allclose(found, motors(*values.values()), rtol=1e-6)
 
 
 def test_a_synchronous_machine_with_a_damper_cage(library):

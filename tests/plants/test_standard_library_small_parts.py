@@ -1,7 +1,7 @@
 """Small parts of the Modelica Standard Library 4.1.0 beside our own ones, each by its closed form.
 
-Values at two times and the derivatives by all parameters that are named. `MODELICA_LIBRARY` names the folder of the
-library; without it the tests are skipped.
+Values at two times, and the derivatives by all parameters that are named, where no waves jump. `MODELICA_LIBRARY` names
+the folder of the library; without it the tests are skipped.
 """
 
 import jax
@@ -11,7 +11,7 @@ import pytest
 from device_library import standard_library
 from open_classes import run_with_slopes
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
 from jaxonomy_dae.library import electrical, rotational, thermal, translational
 from jaxonomy_dae.library.signal import Constant
 from jaxonomy_dae.modelica import Library
@@ -53,17 +53,107 @@ class Plants:
         """`form(t, p)` is the value, with `p[name]` for parameters."""
         self.known.append((variable, form))
 
-    def check(self):
-        system = AcausalCompiler(self.ev, self.d)()
-        ts, names = np.array([0.3, END]), [n for n, _ in self.known]
-        found, slopes = run_with_slopes(system, self.values, ts, names, names)
+    def compiled(self):
+        return AcausalCompiler(self.ev, self.d)()
+
+    def agree(self, found, ts):
         for name, form in self.known:
             np.testing.assert_allclose(
                 found[name], [form(t, self.values) for t in ts], rtol=1e-7, atol=1e-9, err_msg=name
             )
+
+    def agree_with_slopes(self):
+        ts, names = np.array([0.3, END]), [n for n, _ in self.known]
+        found, slopes = run_with_slopes(self.compiled(), self.values, ts, names, names)
+        self.agree(found, ts)
         by_hand = jax.grad(lambda p: sum(jnp.asarray(form(END, p), float) for _, form in self.known))(self.values)
         for name, expected in by_hand.items():
             assert slopes[name] == pytest.approx(float(expected), rel=1e-5, abs=1e-8), name
+
+
+def test_sources_and_signals(library):
+    """Waves, their sums and products, and what switches between them: their values."""
+    plants = Plants(library)
+    part, d, expect = plants.part, plants.d, plants.expect
+    sources = "Blocks.Sources"
+    for name, path, given, form in (
+        ("ramp", "Ramp", {"height": 2.0, "duration": 0.5, "startTime": 0.2, "offset": 0.1},
+         lambda t, p: p["offset"] + p["height"] * jnp.clip((t - p["startTime"]) / p["duration"], 0, 1)),
+        ("cosine", "Cosine", {"amplitude": 2.0, "f": 1.5, "phase": 0.4, "offset": 0.1},
+         lambda t, p: p["offset"] + p["amplitude"] * jnp.cos(2 * jnp.pi * p["f"] * t + p["phase"])),
+        ("damped", "ExpSine", {"amplitude": 2.0, "f": 1.5, "damping": 0.7, "startTime": 0.1},
+         lambda t, p: p["amplitude"] * jnp.exp(-p["damping"] * (t - p["startTime"]))
+         * jnp.sin(2 * jnp.pi * p["f"] * (t - p["startTime"]))),
+        ("rises", "Exponentials", {"outMax": 2.0, "riseTime": 0.5, "riseTimeConst": 0.2, "fallTimeConst": 0.4},
+         lambda t, p: p["outMax"] * (1 - jnp.exp(-jnp.minimum(t, p["riseTime"]) / p["riseTimeConst"]))
+         * jnp.exp(-jnp.maximum(t - p["riseTime"], 0) / p["fallTimeConst"])),
+        ("saw", "SawTooth", {"amplitude": 2.0, "period": 0.25, "offset": 0.1},
+         lambda t, p: p["offset"] + p["amplitude"] * (t / p["period"] - jnp.floor(t / 0.25))),
+        ("pulse", "Pulse", {"amplitude": 2.0, "width": 30.0, "period": 0.25},
+         lambda t, p: p["amplitude"] * ((t / 0.25) % 1 < 0.3)),
+        # At 0.3 it is a third of the way down, and at 0.8 at its height.
+        ("trapezoid", "Trapezoid", {"amplitude": 2.0, "rising": 0.1, "width": 0.1, "falling": 0.3, "period": 0.65},
+         lambda t, p: p["amplitude"] * (2 / 3 if t == 0.3 else 1.0)),
+        ("sweep", "LogFrequencySweep", {"wMin": 1.0, "wMax": 20.0, "duration": 2.0},
+         lambda t, p: p["wMin"] * (p["wMax"] / p["wMin"]) ** (t / p["duration"])),
+    ):  # fmt: skip
+        part(f"{sources}.{path}", name, tried=() if name in ("pulse", "trapezoid") else given, **given)
+        expect(f"{name}.y", lambda t, p, n=name, g=given, f=form: f(t, {k: p.get(f"{n}.{k}", v) for k, v in g.items()}))
+    u, v, w = plants.level("u", 0.7, True), plants.level("v", -0.4, True), plants.level("w", 3.9, True)
+
+    def block(path, name, form, inputs, structure=None, **given):
+        x = part(f"Blocks.{path}", name, structure=structure, tried=given, **given)
+        for n, signal in inputs.items():
+            d.connect(signal, x[n])
+        expect(f"{name}.y", form)
+        return x
+
+    block(
+        "Math.LinearDependency", "mix", lambda t, p: p["mix.y0"] + p["mix.k1"] * p["u.k"] + p["mix.k2"] * p["v.k"],
+        {"u1": u, "u2": v}, y0=0.3, k1=2.0, k2=-1.5,
+    )  # fmt: skip
+    block("Math.Power", "power", lambda t, p: 2.5 ** p["u.k"], {"u": u}, {"base": 2.5})
+    block("Math.Sign", "sign", lambda t, p: -1.0, {"u": v})
+    block("Math.WrapAngle", "wrap", lambda t, p: p["w.k"] - 2 * jnp.pi, {"u": w})
+    block(
+        "Math.MultiSum", "sum", lambda t, p: 2 * p["u.k"] - p["v.k"] + 0.5 * p["w.k"],
+        {"u[1]": u, "u[2]": v, "u[3]": w}, {"nu": 3, "k": [2.0, -1.0, 0.5]},
+    )  # fmt: skip
+    block(
+        "Math.MultiProduct", "product", lambda t, p: p["u.k"] * p["v.k"] * p["w.k"],
+        {"u[1]": u, "u[2]": v, "u[3]": w}, {"nu": 3},
+    )  # fmt: skip
+    block("Routing.RealPassThrough", "through", lambda t, p: p["u.k"], {"u": u})
+    block("Nonlinear.VariableLimiter", "cut", lambda t, p: p["u.k"], {"u": w, "limit1": u, "limit2": v})
+    gain = part("Blocks.Math.MatrixGain", "gain", K=[[1.0, 2.0], [3.0, -1.0]])
+    both, apart = part("Blocks.Routing.Multiplex2", "both"), part("Blocks.Routing.DeMultiplex2", "apart")
+    d.connect(u, both["u1[1]"])
+    d.connect(v, both["u2[1]"])
+    for k in (1, 2):
+        d.connect(both[f"y[{k}]"], gain[f"u[{k}]"])
+        d.connect(gain[f"y[{k}]"], apart[f"u[{k}]"])
+    expect("apart.y1[1]", lambda t, p: p["u.k"] + 2 * p["v.k"])
+    expect("apart.y2[1]", lambda t, p: 3 * p["u.k"] - p["v.k"])
+    # y is the greater of two signals, by a comparison, a negation and a switch.
+    greater, negated, switch = (part(f"Blocks.Logical.{n}", n.lower()) for n in ("Greater", "Not", "Switch"))
+    above, either, number = (
+        part("Blocks.Logical.GreaterThreshold", "above", threshold=0.5),
+        part("Blocks.Logical.Or", "either"),
+        part("Blocks.Math.BooleanToReal", "number", realTrue=3.0, realFalse=-2.0, tried=("realTrue",)),
+    )
+    both_of = part("Blocks.Logical.And", "and_")
+    d.connect(u, greater.u1, switch.u1, above.u)
+    d.connect(v, greater.u2, switch.u3)
+    d.connect(greater.y, negated.u, switch.u2, either.u1, both_of.u1)
+    d.connect(negated.y, either.u2)
+    d.connect(above.y, both_of.u2)
+    d.connect(both_of.y, number.u)
+    expect("switch.y", lambda t, p: p["u.k"])
+    expect("number.y", lambda t, p: p["number.realTrue"])
+    ts = jnp.array([0.3, END])
+    plants.agree(
+        simulate(plants.compiled().with_parameters(plants.values), END, ts=ts, rtol=1e-9, atol=1e-11), ts.tolist()
+    )
 
 
 def test_circuits_shafts_and_heat(library):
@@ -206,4 +296,4 @@ def test_circuits_shafts_and_heat(library):
     d.connect(given.port, store.heat)
     expect("flow.Q_flow", lambda t, p: (p["Gc.k"] + 1 / p["Rc.k"]) * (p["hot.T"] - p["cold.T"] - 273.15))
     expect("store.T", lambda t, p: 300.0 + p["given.Q_flow"] * t / 50.0)
-    plants.check()
+    plants.agree_with_slopes()
