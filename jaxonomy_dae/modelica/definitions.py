@@ -100,13 +100,14 @@ def whens_in(statements: Iterable[tree.Statement]) -> Iterator[tree.Branches]:
 def _by_entries(
     statements: Iterable[tree.Statement], model: tree.Class, is_discrete: Callable[[str], bool]
 ) -> Iterator[tree.Statement]:
-    """The statements with an equation for each entry of a discrete array that stands alone on the left."""
+    """The statements with an equation for each entry of a discrete array that stands alone on the left, and for each
+    discrete result of a function."""
     places: dict[str, list[str]] = {}
     for d in model.declarations:
         array, _, place = d.name.rpartition("[")
         if array and is_discrete(d.name):
             places.setdefault(array, []).append(place[:-1])
-    for s in statements:
+    for s in _by_results(statements, lambda name: is_discrete(name) or name in places):
         if not (isinstance(s, tree.Equality) and isinstance(s.left, tree.Reference)):
             yield s
             continue
@@ -120,6 +121,24 @@ def _by_entries(
             else:
                 entry = _entry_of(s.right, [int(k) for k in place.split(",")])
             yield tree.Equality(tree.Reference((f"{s.left.path}[{place}]",)), entry, s.line)
+
+
+def _by_results(
+    statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool]
+) -> Iterator[tree.Statement]:  # fmt: skip
+    for s in statements:
+        if not (isinstance(s, tree.Equality) and isinstance(s.left, tree.Several)):
+            yield s
+            continue
+        others: list[tree.Expression | None] = []
+        for k, e in enumerate(s.left.entries):
+            if isinstance(e, tree.Reference) and is_discrete(_name(e)):
+                others.append(None)
+                yield tree.Equality(e, tree.Result(s.right, k), s.line)
+            else:
+                others.append(e)
+        if any(e is not None for e in others):
+            yield s._replace(left=tree.Several(tuple(others)))
 
 
 def _entry_of(e: tree.Expression, place: list[int]) -> tree.Expression:

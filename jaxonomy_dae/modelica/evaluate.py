@@ -437,6 +437,7 @@ _EVALUATED: dict[type, Callable[[Evaluator, Any, Names], Value]] = {
     tree.Comprehension: Evaluator._comprehension,
     tree.Part: Evaluator._part,
     tree.Several: lambda self, e, names: [None if x is None else self.evaluate(x, names) for x in e.entries],
+    tree.Result: lambda self, e, names: self.results(e.call, names)[e.number],
     tree.Whole: _refused,
 }
 

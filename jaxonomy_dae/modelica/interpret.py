@@ -195,9 +195,10 @@ class Interpreter(Evaluator):
 
     def _join(self, condition: Value, a: dict[str, Value], b: dict[str, Value], local: dict[str, Value]) -> None:
         """Assigns what two branches assign: that of `a` where the condition holds."""
+        quiet = self.quiet or condition in self.quieted
         for name in a | b:
             otherwise = False if name in ("return", "break") else local.get(name)
-            joined = _joined(condition, a.get(name, otherwise), b.get(name, otherwise), self.quiet)
+            joined = _joined(condition, a.get(name, otherwise), b.get(name, otherwise), quiet)
             local[name] = self._named_truth(joined) if name in JUMPS else self._named(joined)
 
     def _named_truth(self, value: Value) -> Value:

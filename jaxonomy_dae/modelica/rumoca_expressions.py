@@ -228,8 +228,19 @@ class RumocaExpressions:
             name = self.functions[inside["function"]]["parameters"][inside["ordinal"]]["name"]
             return tree.Reference((name,), (subscripts,))
         if kind == "delay":
-            return tree.Call("delay", (), ())
+            return self._delay(self.storage["delays"][inside], places, where)
         self.refuse(f"'{kind}'", where)
+
+    def _delay(self, delay: Json, places: Places, where: Json) -> tree.Expression:
+        """delay(e, T), or delay(e, T, Tmax)."""
+        kind, given = next(iter(delay["kind"].items()))
+        if kind not in ("parameter_delay", "bounded_delay"):
+            self.refuse(f"a delay of the kind '{kind}'", where)
+        # What must be constant is an expression and its value, the delay of a bounded one an expression alone.
+        parts = [given[name] for name in ("delay_time", "delay_max") if name in given]
+        numbers = [part["expression"] if isinstance(part, Mapping) else part for part in parts]
+        arguments = tuple(self.expression(n, places) for n in (delay["source"], *numbers))
+        return tree.Call("delay", arguments, ())
 
     def _indexed(self, inside: Json, first: int, places: Places) -> tree.Expression:
         subscripts: list[tree.Expression] = []

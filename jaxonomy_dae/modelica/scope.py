@@ -70,7 +70,7 @@ class Scope:
         self.being: list[str] = []
         special: dict[str, Callable[..., Value]] = {
             "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self._is_initial,
-            "terminal": lambda: False, "sample": self._sample, SAMPLED: self._sampled, "delay": _delay,
+            "terminal": lambda: False, "sample": self._sample, SAMPLED: self._sampled, "delay": self._delay,
         }  # fmt: skip
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
         special[TIME_TABLE] = self._time_table
@@ -96,6 +96,7 @@ class Scope:
         self.fields.update(fields)
         self.definitions = find_definitions(self.flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
+        self.delays: dict[tuple[Value, Value, Value], sympy.Symbol] = {}
         self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.carried_out: dict[int, dict[str, Value]] = {}
         self.assigned_first: dict[tuple[Statement, ...], dict[str, Value]] = {}
@@ -216,7 +217,7 @@ class Scope:
         if d.value is None:
             if self.kind(d.type) == REAL and not d.dimensions:
                 start = d.modifiers.get("start")
-                return 0.0 if start is None else self._as_parameter(d, self.evaluate(start))
+                return float(self._fall_back(d)) if start is None else self._as_parameter(d, self.evaluate(start))
             if "start" in d.modifiers:  # of an array
                 start = self.evaluate(d.modifiers["start"])
                 sizes = [self.interpreter.count(n) for n in d.dimensions]
@@ -284,7 +285,7 @@ class Scope:
             first = {n: previous(self.stored(n)) for n in assigned if n in kept}
             for n in sorted(remembered(statements, self.flat.model) - first.keys()):
                 start = self._start(self.declared[n].modifiers.get("start"))
-                first[n] = 0.0 if start is None else start
+                first[n] = float(self._fall_back(self.declared[n])) if start is None else start
             self.carried_out[number] = self.interpreter.assigned_by(statements, first)
         return self.carried_out[number]
 
@@ -340,15 +341,24 @@ class Scope:
 
     def _declare_stored(self, d: Declaration) -> Value:
         start = self._start(d.modifiers.get("start"))
-        start = self._least(d.type) if start is None else as_number(start)
+        start = self._fall_back(d) if start is None else as_number(start)
         self.component.discrete(d.name, start=start)
         self.discrete.before(d.name)
         if self.kind(d.type) == REAL:
             self.discrete.reals.add(d.name)
         return self.stored(d.name)
 
+    def _fall_back(self, d: Declaration) -> float | int:
+        """What a variable starts at if nothing says so: what is next to zero within its bounds (section 4.9)."""
+        value: float | int = self._least(d.type)
+        for bound, further in (("min", max), ("max", min)):
+            e = d.modifiers.get(bound)
+            limit = None if e is None else self.evaluate(e)
+            value = further(value, limit) if isinstance(limit, int | float) else value
+        return value
+
     def _least(self, type_name: str) -> int:
-        """What a discrete variable starts at if nothing says so: an enumeration at its first literal, others at 0."""
+        """The number next to zero of a type: an enumeration has its first literal, others have 0."""
         c = self.flat.classes.get(type_name)
         if c is not None and c.made_of is not None:
             return self._least(c.made_of)
@@ -375,7 +385,7 @@ class Scope:
             )  # fmt: skip
         fixed = self._fixed(d) is True
         if fixed and start is None:
-            start = 0.0
+            start = float(self._fall_back(d))
         if d.value is not None:
             self.definitions.equations.append(Equality(Reference((d.name,)), d.value, d.line))
         return self.component.variable(
@@ -513,6 +523,31 @@ class Scope:
         found = self.discrete.at_ticks(clock, sympy.sympify(as_number(value)))
         return sympy.Eq(found, 1) if is_condition(value) else found
 
+    def _delay(self, e: Expression, time: Expression, longest: Expression | None = None) -> Value:
+        by = self.evaluate(time)
+        # With a delay that is constant, the specification asks for no limit, and one that is given says nothing more.
+        changes = isinstance(by, sympy.Expr) and not _is_of_parameters(by)
+        if changes and longest is None:
+            raise ModelError(f"delay(…) with the delay {by}, which changes, needs a third argument, the longest delay")
+        limit = self.evaluate(longest) if changes and longest is not None else None
+        return self._delayed(self.evaluate(e), by, limit)
+
+    def _delayed(self, value: Value, time: Value, longest: Value) -> Value:
+        """A value, or each entry of an array, delayed."""
+        if isinstance(value, list):
+            return [self._delayed(v, time, longest) for v in value]
+        value = as_number(value)
+        if isinstance(time, int | float) and time == 0:
+            return value
+        if not isinstance(value, sympy.Expr) or (_is_of_parameters(value) and not value.has(TimeSymbol)):
+            return value
+        key = value, time, longest
+        if key not in self.delays:
+            name, within = f":delayed[{len(self.delays)}]", self.kept.in_equations
+            by = within(time) if isinstance(time, sympy.Basic) else time
+            self.delays[key] = self.component.delayed(name, within(value), by, longest)
+        return self.delays[key]
+
 
 def _is_of_parameters(value: sympy.Expr) -> bool:
     return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols_of(value))
@@ -539,10 +574,6 @@ def located(model: str, line: int, do: Callable[..., T], *arguments: object) -> 
         raise ModelError(f"{model}, line {line}: {error}") from None
     except (TypeError, ValueError, AttributeError, IndexError, RecursionError) as error:
         raise ModelError(f"{model}, line {line}: {type(error).__name__}: {error}") from error
-
-
-def _delay(*_: Expression) -> Value:
-    raise ModelError("delay(…) needs the past of a variable, which is not kept")
 
 
 def _clocked(name: str, *_: Expression) -> Value:

@@ -124,9 +124,16 @@ class Part(NamedTuple):
     subscripts: tuple["Expression", ...]
 
 
+class Result(NamedTuple):
+    """The result of a function with this number, counted from 0."""
+
+    call: "Expression"
+    number: int
+
+
 Expression: TypeAlias = (
     Number | Truth | Text | Reference | Whole | End | Call | Unary | Binary | Choice | Array | Matrix
-    | Several | Range | Comprehension | Part
+    | Several | Range | Comprehension | Part | Result
 )  # fmt: skip
 
 

@@ -116,3 +116,23 @@ def test_variables_that_are_records():
     }  # fmt: skip
     assert float(c.variables["w.a"].start) == 3 and c.variables["w.a"].fixed
     assert c.parameters["q.a"].value == 5
+
+
+def test_a_function_with_results_of_several_types():
+    """An Integer among the results is an expression, as every Integer that an equation determines."""
+    body = "input Real 'u'; output Real 'y' = 2 * 'u'; output Integer 'n' = integer('u') + 3;"
+    c = built(
+        f"package 'P' {function('f', body)} model 'M' Real 'y'; Integer 'n'; Real 'z'; equation ('y', 'n') = 'f'(1.5); "
+        "'z' = 'n'; end 'M'; end 'P';"
+    )
+    assert [str(e) for e in c.equations] == ["y - 3.0", "z - 4"]
+
+
+def test_without_a_start_it_is_what_is_next_to_zero_within_the_bounds():
+    c = built(
+        "model 'M' Integer 'n'(min = 2); Real 'x'(max = -1.0, fixed = true); Real 'y'(min = 3.0); equation "
+        "der('x') = 1; when time > 1 then 'n' = pre('n') + 1; end when; "
+        "algorithm if noEvent('x' > 0.0) then 'y' := 5; end if; end 'M';"
+    )
+    assert c.parameters["n"].value == 2 and float(c.variables["x"].start) == -1
+    assert "y - smooth(Piecewise((5, x > 0.0), (3.0, True)))" in map(str, c.equations)

@@ -20,6 +20,7 @@ from ...host.members import batch_size, is_batched, say_of_members
 from ...host.rows import filled_up
 from ...host.staging import as_argument, as_array, is_staged, is_traced, on_device, picked
 from ...solve.adjoint.stored_adjoint import default_adjoint
+from ...solve.events.solver import FORGETS
 from ...solve.methods import BDF, Rodas5P, Tsit5
 from ...solve.methods.causes import decay_at, is_stiff
 from ...solve.methods.drive import is_implicit
@@ -47,6 +48,8 @@ from .step_sizes import clipped, controller_for, scaled_atol
 
 FEW_NUMBERS = 20_000  # on one side of all events: up to so many, states before and after events are kept (160 kB)
 ROOM = 100  # events that the log of a first run has room for; a run with more is made again with room for all
+# Steps within the longest delay for which there is room, and the most numbers that they take: each step copies these.
+REMEMBERED, MOST_REMEMBERED = 1024, 40_000
 MOST_EVENTS = 2**7 * ROOM  # of a run, if the user does not say: with a few steps each, near the default max_steps
 MOST_TICKS = 2**24  # counted in addition to `max_steps`: days of running
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
@@ -273,11 +276,21 @@ class _Call:
     known: bool
     duration: float | None
     asked: Asked
+    more: int = 1  # times the room for what is delayed
 
     @property
     def bounds(self) -> tuple[int, int]:
         """The largest numbers of steps and of events."""
         return self.asked.max_steps, MOST_EVENTS if self.max_events is None else self.max_events
+
+    @property
+    def remembered(self) -> int:
+        """For so many steps within the longest delay there is room."""
+        delays = self.system.plan.delays
+        if delays is None:
+            return 0
+        room = min(REMEMBERED, max(MOST_REMEMBERED // (9 * len(delays)), 64))
+        return min(self.more * room, self.asked.max_steps) + 1
 
     @functools.cached_property
     def run_by(self) -> Solver:
@@ -309,6 +322,7 @@ class _Call:
             max_steps=asked.max_steps + self.ends.count + self.ticks, progress=self.progress,
             max_events=self.bounds[1], room=room,
             save_events=few and self.known if self.save_events is None else self.save_events,
+            remembered=self.remembered,
         )  # fmt: skip
 
     def watch(self, traced: bool) -> Watch | None:
@@ -380,6 +394,10 @@ class _Call:
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": t}
             outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
             counts = outcome.numbers() | before
+        while is_code(outcome.result, FORGETS) and call.remembered <= self.asked.max_steps:
+            call = dataclasses.replace(call, more=4 * call.more)
+            outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
+            counts = outcome.numbers()
         if outcome.events is not None and self.max_events is None and float(outcome.events.count) > room:
             room = _room_for(float(outcome.events.count))
             outcome = run_compiled(rows, call.options(room), None, begun=call.begun)

@@ -1,0 +1,32 @@
+"""The delayed quantities of a flattened model."""
+
+import dataclasses
+
+import numpy as np
+
+from .starts import Start
+
+
+@dataclasses.dataclass(frozen=True)
+class DelayTable:
+    """The delayed quantities of a model, in the order of declaration.
+
+    - `text`: their names; `source`: the variables that they repeat, `instant`: those that are the times at which they
+        are read, shape (delays,).
+    - `read`: the places among the discrete variables of those by which equations read the past, shape (delays, 4):
+        `Delay.begins`, `base`, `value`, `rate`.
+    - `longest`: the longest delay of each, in parameters; `constant`: whether it is always that.
+    """
+
+    text: tuple[str, ...]
+    source: np.ndarray
+    instant: np.ndarray
+    read: np.ndarray
+    longest: tuple[Start, ...]
+    constant: tuple[bool, ...]
+
+    def __len__(self):
+        return len(self.text)
+
+
+NO_DELAYS = DelayTable((), *(np.zeros(0, np.int64),) * 2, np.zeros((0, 4), np.int64), (), ())
