@@ -68,6 +68,8 @@ def _expression(e: Json, ordinals: Mapping[str, int]) -> tree.Expression:
         return tree.Call(_name(inside), each(inside["args"]), ())
     if kind == "BuiltinCall":
         return tree.Call(inside["function"].lower(), each(inside["args"]), ())
+    if kind == "Unary" and "Not" in inside["op"]:
+        return tree.Unary("not", _expression(inside["rhs"], ordinals))
     if kind == "Unary" and "Minus" in inside["op"]:
         return tree.Unary("-", _expression(inside["rhs"], ordinals))
     if kind == "If":

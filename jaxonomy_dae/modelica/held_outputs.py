@@ -17,9 +17,13 @@ def with_held_outputs(flat: FlatModel, outputs: Collection[str]) -> FlatModel:
     """The model with variables that keep those outputs which events assign or whose values before an event are read."""
     model = flat.model
     statements = model.equations, model.algorithms, tuple(d.value for d in model.declarations)
+    sections = [section for section in model.algorithms if any(whens_in(section))]
     kept = {_whole(n) for n in assigned_in(tuple(whens_in(model.equations)))}
-    kept |= {_whole(n) for section in model.algorithms for n in assigned_in(section)}
-    kept |= {_whole(n) for n in read_before(statements)}
+    kept |= {_whole(n) for section in sections for n in assigned_in(section)}
+    # What is Real and read before an event may be continuous.
+    others = {_whole(n) for section in model.algorithms for n in assigned_in(section)}
+    others |= {_whole(n) for n in read_before(statements)}
+    kept |= others - {_whole(d.name) for d in model.declarations if d.type == "Real"}
     kept &= {_whole(n) for n in outputs}
     if not kept:
         return flat
