@@ -122,8 +122,8 @@ class Remembered(eqx.Module):
     def read(
         self, t: Time, instant: Float[Array, " delays"], waits: Bool[Array, " delays"]
     ) -> tuple[Array, Array, Array]:
-        """Returns (what the sources were, their rates, the rates of these) at an instant for each, at the time t; constant
-        under derivatives by `t` and `instant`."""
+        """Returns (what the sources were, their rates, the rates of these) at an instant for each, at the time t;
+        constant under derivatives by `t` and `instant`."""
         past, n = self.past, self.past.n
         t, instant, moves = still((t, instant, (self.low, self.high, self.ahead)))
         low, high, ahead = moves
