@@ -21,8 +21,9 @@ class Delay:
 
     - `name`: of the variable that is delayed; `source`: of the hidden one that it repeats; `instant`: of the hidden one
         that is the time at which it is read.
-    - `begins`, `base`, `value`, `rate`: of the discrete variables by which equations read the past: what is delayed is
-        value + rate·(instant − base), or while `begins` is 1, what the source was at the initial time.
+    - `begins`, `base`, `value`, `rate`, `bend`: of the discrete variables by which equations read the past: what is
+        delayed is value + rate·(instant − base) + bend·(instant − base)²/2, or while `begins` is 1, what the source was
+        at the initial time.
     - `longest`: the longest delay, in parameters; `is_constant`: all delays are that.
     """
 
@@ -33,6 +34,7 @@ class Delay:
     base: str
     value: str
     rate: str
+    bend: str
     longest: sympy.Expr
     is_constant: bool
 
@@ -92,11 +94,13 @@ class DelayDeclarations(DiscreteDeclarations):
             raise ModelError(f"{where}: the delay must be positive; got {limit}. Without a delay, write the expression")
         late = self._declare(name, "variable", unit=unit)
         source, instant, first = (self._declare(f":{name}.{part}", "event") for part in ("source", "instant", "first"))
-        begins, base, value, rate = (
+        begins, base, value, rate, bend = (
             self._unshown(f":{name}.{part}", start)
-            for part, start in (("begins", 1.0), ("base", 0.0), ("value", 0.0), ("rate", 0.0))
+            for part, start in (("begins", 1.0), ("base", 0.0), ("value", 0.0), ("rate", 0.0), ("bend", 0.0))
         )
-        read = begins * first + (1 - begins) * (value + rate * (instant - base))
+        # Base is the instant itself: the terms count where this is differentiated, by time or by parameters.
+        since = instant - base
+        read = begins * first + (1 - begins) * (value + rate * since + bend * since**2 / 2)
         self.add_equations(
             sympy.Eq(source, parts[0], evaluate=False),
             sympy.Eq(instant, self.ev.t - parts[1], evaluate=False),
@@ -109,7 +113,7 @@ class DelayDeclarations(DiscreteDeclarations):
         self.events.append(over)
         self.delays.append(
             Delay(
-                late.path, source.path, instant.path, begins.path, base.path, value.path, rate.path, limit,
+                late.path, source.path, instant.path, begins.path, base.path, value.path, rate.path, bend.path, limit,
                 is_constant=longest is None,
             )
         )  # fmt: skip

@@ -24,7 +24,7 @@ class DelayPlan:
 
     - `table`: their table; `sources`, `source`: the program that computes what is delayed, and where it has it;
         `instants`, `instant`: the same for the times at which the past is read.
-    - `parameters`: those by which equations read the past, shape (delays, 4), as `DelayTable.read`.
+    - `parameters`: those by which equations read the past, shape (delays, 5), as `DelayTable.read`.
     """
 
     table: DelayTable

@@ -13,8 +13,8 @@ class DelayTable:
 
     - `text`: their names; `source`: the variables that they repeat, `instant`: those that are the times at which they
         are read, shape (delays,).
-    - `read`: the places among the discrete variables of those by which equations read the past, shape (delays, 4):
-        `Delay.begins`, `base`, `value`, `rate`.
+    - `read`: the places among the discrete variables of those by which equations read the past, shape (delays, 5):
+        `Delay.begins`, `base`, `value`, `rate`, `bend`.
     - `longest`: the longest delay of each, in parameters; `constant`: whether it is always that.
     """
 
@@ -29,4 +29,4 @@ class DelayTable:
         return len(self.text)
 
 
-NO_DELAYS = DelayTable((), *(np.zeros(0, np.int64),) * 2, np.zeros((0, 4), np.int64), (), ())
+NO_DELAYS = DelayTable((), *(np.zeros(0, np.int64),) * 2, np.zeros((0, 5), np.int64), (), ())

@@ -31,7 +31,7 @@ def delay_table(model: ModelNumbers) -> DelayTable:
         text.append(f"{model.paths[k]}.{delay.name}")
         source.append(model.variable(i, delay.source)[row])
         instant.append(model.variable(i, delay.instant)[row])
-        names = (delay.begins, delay.base, delay.value, delay.rate)
+        names = (delay.begins, delay.base, delay.value, delay.rate, delay.bend)
         read.append([place[parameter(i, name, row)] for name in names])
         longest.append(in_parameters(model, parameter, i, row, delay.longest))
         constant.append(delay.is_constant)

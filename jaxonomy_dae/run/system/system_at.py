@@ -484,7 +484,7 @@ class SystemAt:
         return jnp.stack([sources, self._filled(self.run(delays.instants, x, Refinement.ROOT), delays.instant)])
 
     def past_read(self, x: Array) -> Array:
-        """The discrete variables by which equations read the past, shape (delays, 4)."""
+        """The discrete variables by which equations read the past, shape (delays, 5)."""
         inputs = input_values(self.plan, self.inputs, self.t, self.dtype)
         return self._with_past(x, inputs, self.t)[self._delays().parameters]
 

@@ -119,9 +119,11 @@ class Remembered(eqx.Module):
         """The same side of another past."""
         return dataclasses.replace(self, past=past)
 
-    def read(self, t: Time, instant: Float[Array, " delays"], waits: Bool[Array, " delays"]) -> tuple[Array, Array]:
-        """Returns (what the sources were, their rates) at one instant for each, at the time t; constant under
-        derivatives by `t` and `instant`."""
+    def read(
+        self, t: Time, instant: Float[Array, " delays"], waits: Bool[Array, " delays"]
+    ) -> tuple[Array, Array, Array]:
+        """Returns (what the sources were, their rates, the rates of these) at an instant for each, at the time t;
+        constant under derivatives by `t` and `instant`."""
         past, n = self.past, self.past.n
         t, instant, moves = still((t, instant, (self.low, self.high, self.ahead)))
         low, high, ahead = moves
@@ -135,8 +137,12 @@ class Remembered(eqx.Module):
         begins = number == 0
         start, end = jnp.where(begins[:, None], jnp.arange(2, dtype=rows.dtype), rows[:, 1:3]).T
         half = 0.5 * (end - start)
-        value, rate = _evaluated(own, jnp.where(begins, 0.0, (instant - start) / half - 1.0))
-        return jnp.where(begins, past.first, value), jnp.where(begins, 0.0, rate / half)
+        place = jnp.where(begins, 0.0, (instant - start) / half - 1.0)
+        value, rate = _evaluated(own, place)
+        powers = jnp.arange(1, NODES, dtype=own.dtype)[:, None]
+        _, bend = _evaluated(own[1:] * powers, place)
+        rate, bend = (jnp.where(begins, 0.0, one) for one in (rate / half, bend / half**2))
+        return jnp.where(begins, past.first, value), rate, bend
 
 
 class Reached(NamedTuple):
