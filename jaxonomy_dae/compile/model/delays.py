@@ -29,4 +29,5 @@ class DelayTable:
         return len(self.text)
 
 
-NO_DELAYS = DelayTable((), *(np.zeros(0, np.int64),) * 2, np.zeros((0, 5), np.int64), (), ())
+_NONE = np.zeros(0, np.int64)
+NO_DELAYS = DelayTable((), _NONE, _NONE, np.zeros((0, 5), np.int64), (), ())
