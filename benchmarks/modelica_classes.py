@@ -5,11 +5,12 @@
 
 `--library` holds the folder Modelica (a checkout of modelica/ModelicaStandardLibrary, tag v4.1.0; not part of this
 project). Each class is opened by the front end and becomes a component, each port of which meets a boundary whose flow
-is its potential, each input a constant. The plant is compiled, which refuses one whose equations are not as many as its
-unknowns. Parameters without a value are numbers from 1 to 2, all different: with equal ones, coils have no leakage.
-Classes that are partial, and those without connectors, are counted apart. `GIVEN` holds what some classes do not have
-by themselves. `--sample` puts the classes in a random order in which any number of the first ones has each package in
-proportion; of `--classes` so chosen, those that take long to open come last.
+is its potential, each input a constant; a class whose surroundings decide its clock gets one of 1 s. The plant is
+compiled, which refuses one whose equations are not as many as its unknowns. Parameters without a value are numbers from
+1 to 2, all different: with equal ones, coils have no leakage. Classes that are partial, and those without connectors,
+are counted apart. `GIVEN` holds what some classes do not have by themselves. `--sample` puts the classes in a random
+order in which any number of the first ones has each package in proportion; of `--classes` so chosen, those that take
+long to open come last.
 
 Classes run in a process that is replaced when one of them takes too long. Lines of JSON go to `--out`, from where a
 second call goes on; the table by sub-library and the reasons go to `--page`.
@@ -62,6 +63,9 @@ GIVEN = {  # modifications of classes whose names begin so: the first that fits
     "Modelica.Electrical.Machines.Utilities.MultiTerminalBox": STAR,
     "Modelica.Magnetic.QuasiStatic.FundamentalWave.Utilities.TerminalBox": STAR,
     "Modelica.Magnetic.QuasiStatic.FundamentalWave.Utilities.MultiTerminalBox": STAR,
+    "Modelica.Electrical.Machines.Thermal.SynchronousMachines.ThermalAmbientSM": "useDamperCage = true",
+    "Modelica.Magnetic.FundamentalWave.BasicMachines.SynchronousMachines.SM_": "useDamperCage = true",
+    "Modelica.Thermal.HeatTransfer.Sensors.ConditionalFixedHeatFlowSensor": "useFixedTemperature = true",
     "Modelica.Blocks.Math.MinMax": "nu = 2",
     "Modelica.Blocks.MathBoolean.": "nu = 2",
     "Modelica.Blocks.MathInteger.": "nu = 2",
@@ -246,16 +250,18 @@ def _stages(library: Library, name: str, row: dict):
     yield "compiled"
 
 
-def _opened(library: Library, name: str, given: list[str]) -> OpenClass:
-    """A class with what is given, and with 1 for parameters that decide its equations."""
+def _opened(library: Library, name: str, given: list[str], clock: float | None = None) -> OpenClass:
+    """A class with what is given, and with 1 for parameters that decide its equations and for a clock."""
     try:
-        return library.opened(name, ", ".join(filter(None, given)))
+        return library.opened(name, ", ".join(filter(None, given)), clock=clock)
     except ModelError as error:
+        if clock is None and "surroundings decide when its clock ticks" in str(error):
+            return _opened(library, name, given, 1.0)
         unknown = _DECIDES.search(str(error))
         value = f"{unknown[1]} = 1" if unknown else ""
         if not value or value in given:
             raise
-    return _opened(library, name, [*given, value])
+    return _opened(library, name, [*given, value], clock)
 
 
 def _values(of: OpenClass) -> dict[str, Any]:

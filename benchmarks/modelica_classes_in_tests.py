@@ -15,7 +15,7 @@ from typing import Any
 from unittest.mock import MagicMock
 
 TESTS = Path(__file__).parent.parent / "tests"
-MODULES = ("test_standard_library", "test_standard_library_plants")
+MODULES = sorted(file.stem for file in (TESTS / "plants").glob("test_standard_library*.py"))
 
 
 class Noted:
@@ -61,6 +61,8 @@ def _asked_for(tests: Any, noted: Noted) -> None:
         "AcausalDiagram",
         "EqnEnv",
         "Constant",
+        "Integrator",
+        "Ramp",
         "Step",
         "electrical",
         "rotational",

@@ -40,6 +40,7 @@ from jaxonomy_dae.modelica import FlatComponent, load
 SECONDS, MEMORY = 120, 4 << 30  # of one file's process: time of the processor, bytes of memory beside XLA's code
 AGREES = 0.002  # of a signal's range, and of the run's time
 POINTS = 1000  # the most saved times
+STEPS_OF_A_RUN = 2**17  # at most: processor time is what limits a run
 STEPS = (1e-5, 1e-3, 1e-2)  # of a parameter, for differences: of longer steps, the runs' own errors count less
 CLOSE = 1e-3  # relative error of a gradient that counts as right
 SAID = 120  # letters of a message in the list of texts
@@ -128,7 +129,8 @@ def _rows(file: Path, references: Path, gradients: bool, roots: Sequence[str] = 
     except MemoryError:
         row |= {"error": "memory", "kind": "memory"}
     except Exception as error:
-        row |= {"error": f"{type(error).__name__}: {error}"[:600], "kind": type(error).__name__}
+        said = str(error).replace(str(file), file.name)  # rows say nothing of this machine
+        row |= {"error": said[:600], "kind": type(error).__name__}
     row["seconds"] = round(time.process_time() - start, 2)
     yield row
 
@@ -154,7 +156,7 @@ def _stages(file: Path, references: Path, gradients: bool, row: dict, roots: Seq
     ts = ts[(ts >= begin) & (ts <= end)]
     ts = jnp.asarray(ts[:: -(-len(ts) // POINTS)])
     rtol = min(said.get("Tolerance", 1e-6), 1e-6)
-    solution = simulate(system, end, t0=begin, ts=ts, rtol=rtol)
+    solution = simulate(system, end, t0=begin, ts=ts, rtol=rtol, max_steps=STEPS_OF_A_RUN)
     row["steps"] = int(solution.stats["num_steps"])
     yield "run"
     if not len(data):
@@ -321,7 +323,8 @@ EXPLAINED_GRADIENTS = {
     "Electrical.Analog.Examples.NandGate": "the second derivative is by the start of an Integer",
     "Magnetic.FluxTubes.Examples.MovingCoilActuator.ArmatureStroke": "ours is not-a-number where differences have "
     "0.0010 and 0.0002: an armature starts at rest on a stop; not explained further",
-    "Mechanics.Rotational.Examples.Backlash": "2.4 %, not explained",
+    "Mechanics.Rotational.Examples.Backlash": "the laws of its contacts bend inside noEvent, where no step ends: at a "
+    "tolerance of 1e-8 ours is off by 14 %, at 1e-10 by 0.8 % and at 1e-12 by 0.2 %",
     "Mechanics.Rotational.Examples.OneWayClutch": "one of the two is by the start of an Integer",
     "Mechanics.MultiBody.Examples.Elementary.InitSpringConstant": "nothing moves, so that the signals, and "
     "with them both derivatives, are zero but for rounding",

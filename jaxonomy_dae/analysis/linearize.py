@@ -75,6 +75,7 @@ def linearize(
         each other alone; this is not noticed inside jit, grad and vmap.
     """
     check_system(system)
+    system.plan.refuse_delays("a delay has no state space of finite size: put library.signal.PadeDelay in its place")
     dtype = system.parameters.values.dtype
     names, outputs = _checked_names(system, inputs, "inputs"), _checked_names(system, outputs, "outputs")
     states = None if states is None else system.plan.entry_names(states)

@@ -86,6 +86,7 @@ def steady_state(
     - `InitializationError` if there is no consistent initial point to start from.
     """
     check_system(system)
+    system.plan.refuse_delays("equilibria of models with delays are not searched for: run until it rests, simulate(…)")
     places = _places(system, drifting)
     found, t, inputs, _ = equilibrium_from(system, t, inputs, initial, places, throw)
     return point_of(system, found, t, inputs, drifting=places, singular_is_error=True, throw=throw)

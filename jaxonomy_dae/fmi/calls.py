@@ -44,7 +44,7 @@ class Calls:
     - `indicators`: the event indicators;
     - `event(sign)`, which is told the time of the next time event, too: what an event leaves: states, the number of
         the new history, the time of the next time event, whether there is one, and whether the run ends;
-    - `start`: the states at the start, of parameters alone.
+    - `start`: the states at the start, of (t, *u, *p).
     """
 
     def __init__(self, fmu: Described, outputs: Sequence[str], parameters: Sequence[str]):
@@ -64,7 +64,7 @@ class Calls:
         self._continuous = [k for k, n in enumerate([*fmu.slopes, *outputs]) if fmu.is_continuous(n)]
         self.function = self._of_scalars(self._values, self._jacobian, self.n_unknowns)
         self.indicators = self._of_scalars(self._signs, self._jacobian_of_signs, self.n_indicators)
-        self.start = self._of_parameters()
+        self.start = self._of_start()
 
     def event(self, sign: Sign) -> Callable[..., Array]:
         """What an event leaves at which an indicator, by its number, gets a sign, true for positive; None: at the
@@ -86,11 +86,12 @@ class Calls:
         return instance
 
     def starts_of(self, parameters: Sequence[float]) -> np.ndarray:
-        """The states with which the FMU starts."""
-        return self._starts(np.asarray(parameters, float))
-
-    def _starts(self, parameters: np.ndarray) -> np.ndarray:
+        """The states with which the FMU starts at time zero, with the inputs that it names."""
         return self._histories.at(tuple(map(float, parameters)), 0).after
+
+    def _starts(self, given: np.ndarray) -> np.ndarray:
+        t, u, p = float(given[0]), given[1 : 1 + self._m], given[1 + self._m :]
+        return self._histories.started(tuple(map(float, p)), t, u)
 
     def _values(self, at: Point) -> np.ndarray:
         return self._placed(at).values()
@@ -174,11 +175,21 @@ class Calls:
             out[:, k] = (self._signs(above) - self._signs(below)) / distance
         return out
 
-    def _jacobian_of_starts(self, parameters: np.ndarray) -> np.ndarray:
-        out, none = np.zeros((self._n, self._k)), np.zeros(0)
-        at = Point(0.0, none, none, tuple(map(float, parameters)), 0)
-        for k, above, below, distance in self._moved(at, by_parameters=True):
-            out[:, k] = (self._starts(np.array(above.p)) - self._starts(np.array(below.p))) / distance
+    def _jacobian_of_starts(self, given: np.ndarray) -> np.ndarray:
+        """The derivatives of the states at the start by (t, u, p), shape (states, …). Those by time are taken forward:
+        an FMU need not start before time zero."""
+        out, n = np.zeros((self._n, len(given))), 1 + self._m
+        t, u, p = float(given[0]), given[1:n], tuple(map(float, given[n:]))
+        h = STEP * max(abs(t), 1.0)
+        out[:, 0] = (self._histories.started(p, t + h, u) - self._histories.started(p, t, u)) / h
+        at = Point(t, np.zeros(self._n), u, p, 0)
+        for by_parameters, first in ((False, 0), (True, n)):
+            for k, above, below, distance in self._moved(at, by_parameters):
+                k = first + k - (0 if by_parameters else self._n)
+                if k < 1:  # time, and states
+                    continue
+                ends = (self._histories.started(m.p, m.t, m.u) for m in (above, below))
+                out[:, k] = np.subtract(*ends) / distance
         return out
 
     def _jacobian_of_after(self, sign: Sign, at: Point, due: float, by_parameters: bool) -> np.ndarray:
@@ -308,8 +319,8 @@ class Calls:
 
         return _differentiable(self._lock, self._histories, lambda given: values(*read(given)), columns, m)
 
-    def _of_parameters(self) -> Callable[..., Array]:
-        """The start as a function of parameters."""
+    def _of_start(self) -> Callable[..., Array]:
+        """The start as a function of time, inputs and parameters."""
         return _differentiable(
             self._lock, self._histories, self._starts, lambda given, needs: self._jacobian_of_starts(given), self._n
         )  # fmt: skip

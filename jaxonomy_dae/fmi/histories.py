@@ -57,6 +57,7 @@ class Histories:
         self._described, self._new, self._most = described, new, 1 if described.only_once else most
         self._events: list[Event | None] = [None]
         self._numbers: dict[tuple, int] = {}
+        self._inputs = np.array([described.start(n) for n in described.inputs])
         self._held: list[_Held] = []  # the one used last comes last
 
     def number(self, event: Event) -> int:
@@ -106,6 +107,13 @@ class Histories:
         self._held[-1].at = None
         return instance
 
+    def started(self, parameters: Parameters, t: float, u: np.ndarray) -> np.ndarray:
+        """The states with which the FMU starts at t, with these inputs."""
+        instance = self.at(parameters, 0)
+        self._held[-1].at = None
+        instance.start(parameters, t, u)
+        return instance.after
+
     def forget_instances(self) -> None:
         """Takes new instances from now on: one that has failed must not be called again."""
         self._held.clear()
@@ -130,8 +138,9 @@ class Histories:
             number = self.event(number).parent
         held.at = None  # until all has gone well
         if not number:
-            first = self.event(way[-1]).t if way else 0.0
-            held.instance.start(parameters, first)
+            first = self.event(way[-1]) if way else None
+            t, u = (0.0, self._inputs) if first is None else (first.t, first.u)
+            held.instance.start(parameters, t, u)
         for number in reversed(way):
             event = self.event(number)
             self._happen(held, event, (parameters, number, aside))

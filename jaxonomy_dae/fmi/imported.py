@@ -76,8 +76,9 @@ class FmuComponent(Component):
             self.parameter(own(n), float(v), unit=fmu.unit(n), bounds=fmu.bounds(n))
             for n, v in zip(parameters, values, strict=True)
         ]
+        held_by = [*fmu.inputs, *parameters]  # what the states at the start may depend on
         x = [
-            self.variable(own(n), unit=fmu.unit(n), nominal=fmu.nominal(n), start=float(v), fixed=not parameters)
+            self.variable(own(n), unit=fmu.unit(n), nominal=fmu.nominal(n), start=float(v), fixed=not held_by)
             for n, v in zip(fmu.states, calls.starts_of(values), strict=True)
         ]
         u = [self.input(own(n), default=fmu.start(n)) for n in fmu.inputs]
@@ -94,8 +95,8 @@ class FmuComponent(Component):
         self.add_equations(*(sympy.Eq(der(v), f, evaluate=False) for v, f in zip(x, found, strict=False)))
         for one, value in zip(shown, found[len(x) :], strict=True):
             self.output(own(one), value, unit=fmu.unit(one))
-        if parameters and x:
-            starts = self._function("starts", calls.start, held, len(x))
+        if held_by and x:
+            starts = self._function("starts", calls.start, [ev.t, *u, *held], len(x))
             self.initially(*(sympy.Eq(v, s, evaluate=False) for v, s in zip(x, starts, strict=True)))
         if calls.has_events:
             self._declare_events(calls, memory, point, x)

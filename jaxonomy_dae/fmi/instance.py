@@ -41,8 +41,9 @@ class Instance:
 
     # --- modes ------------------------------------------------------------------------------------------------------
 
-    def start(self, parameters: Sequence[float], t: float) -> None:
-        """Starts anew at t. Parameters are set before the start, as fixed ones must be."""
+    def start(self, parameters: Sequence[float], t: float, u: Sequence[float] | np.ndarray) -> None:
+        """Starts anew at t. Parameters are set before the start, as fixed ones must be, and inputs during it: the
+        states at the start may depend on them."""
         if self._used:
             self.model.reset()
         self._used = True
@@ -54,6 +55,8 @@ class Instance:
             self.model.enterInitializationMode()
         else:
             self.model.enterInitializationMode(startTime=t)
+        if len(u):
+            self._set_reals(self._inputs, u)
         self.model.exitInitializationMode()
         if not self.n_indicators:
             self.n_indicators = self._count_indicators()
@@ -103,7 +106,8 @@ class Instance:
         out = np.zeros(len(self._read))
         for kind, places in self._of_type.items():
             references = [self.described.reference(self._read[k]) for k in places]
-            suffix = kind if kind != "Enumeration" else "Integer"
+            whole = "Integer" if self.described.version == 2 else "Int64"
+            suffix = whole if kind == "Enumeration" else kind
             try:
                 out[places] = getattr(self.model, f"get{suffix}")(references)
             except Exception as error:

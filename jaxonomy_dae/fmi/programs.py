@@ -381,6 +381,7 @@ def check_exportable(system: AcausalSystem) -> None:
             f"an FMU computes in double precision, and this system has {system.parameters.values.dtype} numbers: "
             'jax.config.update("jax_enable_x64", True) before it is compiled'
         )
+    system.plan.refuse_delays("an exported model keeps no past: put library.signal.PadeDelay in its place")
     table = system.plan.inputs
     differentiated = [table.names[k] for k, order in zip(table.owner, table.order, strict=True) if order]
     if differentiated:

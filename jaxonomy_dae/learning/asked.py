@@ -99,6 +99,8 @@ def checked_method(system: AcausalSystem, given: object) -> str | Shooting | Fil
             f"Innovations(); got {given!r}"
         )
     plan = system.plan
+    if isinstance(given, Shooting):
+        plan.refuse_delays("the nodes of multiple shooting hold no past: use method='growing'")
     if isinstance(given, Shooting) and system.discretes:
         raise ModelError(
             f"method: '{system.discretes[0]}' is a discrete variable, which the nodes of multiple shooting do "

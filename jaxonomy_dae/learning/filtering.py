@@ -171,6 +171,7 @@ def check_model(method: Filter | Innovations, system: AcausalSystem) -> None:
             f"{what}: '{system.discretes[0]}' is a discrete variable, which is not normal and which no measurement "
             "corrects: use method='single' or 'growing'"
         )
+    plan.refuse_delays(f"{what} corrects states, and not the past: use method='single' or 'growing'")
     if plan.held is not None:
         raise ModelError(
             f"{what}: constraints of this model come and go with its modes, and its degrees of freedom with them: use "

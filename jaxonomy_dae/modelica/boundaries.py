@@ -2,8 +2,11 @@
 
 A front end that flattens a class alone takes it for a complete model: what enters by a stream is then what leaves, and
 a body believes that it is the root of all frames. So the class becomes a component of a model. Each of its connectors
-with streams is connected to a boundary, whose stream variables are what `inStream` reads. A boundary that is a root is
-joined to each tree of frames; in place of the equations that a connection to it would bring, as many others stand.
+with streams is connected to a boundary, whose stream variables are what `inStream` reads. In a class with semiLinear
+each connector with flows is: the front end takes flows of loose connectors for zero, and puts h = h1 in the place of
+H_flow = semiLinear(m_flow, h, h1). So is each one whose `cardinality` an equation reads, which is zero for loose ones.
+A boundary that is a root is joined to each tree of frames; in place of the equations that a connection to it would
+bring, as many others stand.
 Afterwards, everything that reads variables of boundaries goes out, and so does an `inner` component that the front end
 has added by itself, as `world`, if no equation of the class reads its variables.
 """
@@ -21,7 +24,7 @@ from .front_end import Flattened, FrontEnd, Unbalanced, Unrooted
 from .rumoca_expressions import SCALAR, Json
 
 MODEL = "Opened"  # of the text in which a class is opened
-_INSIDE, _RIM = "opened__", "rim__"  # the class, and its boundaries, in that model
+INSIDE, RIM = "opened__", "rim__"  # the class, and its boundaries, in that model
 
 
 class _Kind(NamedTuple):
@@ -55,11 +58,12 @@ _KINDS = (
 
 
 class Closed(NamedTuple):
-    """A class that was flattened as a component of a model: `outer` are the variables of components that the front end
-    has added, `graph` are edges of the trees of overdetermined records and `roots` those of its records that begin a
-    tree."""
+    """A class that was flattened as a component of a model: `bounded` are the connectors that met a boundary, `outer`
+    the variables of components that the front end has added, `graph` edges of the trees of overdetermined records, and
+    `roots` those of its records that begin a tree."""
 
     found: Flattened
+    bounded: frozenset[str] = frozenset()
     outer: frozenset[str] = frozenset()
     graph: tuple[tuple[str, str], ...] = ()
     roots: tuple[str, ...] = ()
@@ -71,39 +75,43 @@ def flattened(
     changes: str = "",
     source: str | None = None,
     records: Callable[[], Mapping[str, bool]] = dict,
+    counted: frozenset[str] = frozenset(),
 ) -> Closed:
     """Flattens a class, alone or, if its connectors ask for it, with boundaries. `records` names the overdetermined
     records of its connectors, and says whether the connector is conditional: nothing else tells of those that no
-    equation relates to others.
+    equation relates to others. `counted` are those of its connectors whose connections its equations count.
 
     **Raises:**
 
     - `ModelError` as `FrontEnd.flatten`.
     """
     before = f"{source or ''}\n"
-    modified = f"{_INSIDE}({changes})" if changes else _INSIDE
+    modified = f"{INSIDE}({changes})" if changes else INSIDE
     alone, trees = _alone(front_end, name, changes, source, records)
-    streams = list(_with_streams(alone.flat))
-    if not trees and not streams:
+    bounded = list(_connectors(alone.flat, "flow" if _with_semi_linear(alone.dae) else "stream"))
+    bounded += [
+        n for n in _connectors(alone.flat, "flow") if n in counted - {*bounded} and not _in_graph(alone.flat, n)
+    ]
+    if not trees and not bounded:
         return Closed(alone, graph=_edges(alone.flat), roots=tuple(alone.flat["definite_roots"]))
     variables = alone.flat["variables"]
     declared, equations, renamed = [f"{name} {modified};"], [], {}
     if "world.enableAnimation" in variables:
         # Without animation, whose shapes are variables that nothing reads.
         declared.append("inner Modelica.Mechanics.MultiBody.World world(enableAnimation = false);")
-    for k, top in enumerate(streams):
+    for k, top in enumerate(bounded):
         declared += _rim(k, top, variables)
-        equations.append(f"connect({_INSIDE}.{top}, {_RIM}{k}.port);")
+        equations.append(f"connect({INSIDE}.{top}, {RIM}{k}.port);")
         for n, v in variables.items():
             if n.startswith(f"{top}.") and v["stream"]:
                 stream = n[len(top) + 1 :]
-                renamed[f"{_RIM}{k}.port.{stream}"] = f"{top}.{inflow(stream)}"
+                renamed[f"{RIM}{k}.port.{stream}"] = f"{top}.{inflow(stream)}"
     for k, (n, kind) in enumerate(_inputs(alone.dae)):
-        declared.append(f"input {kind} {_RIM}u{k}{_size(n, variables)};")
-        equations.append(f"{_INSIDE}.{n} = {_RIM}u{k};")
-    roots = _roots(trees, f"{_INSIDE}.")
+        declared.append(f"input {kind} {RIM}u{k}{_size(n, variables)};")
+        equations.append(f"{INSIDE}.{n} = {RIM}u{k};")
+    roots = _roots(trees, f"{INSIDE}.")
     text = f"{before}{_model([*declared, *roots[0]], [*roots[1], *equations])}"
-    return _as_alone(front_end.flatten(text, MODEL, called=name), alone, renamed)
+    return _as_alone(front_end.flatten(text, MODEL, called=name), alone, renamed)._replace(bounded=frozenset(bounded))
 
 
 def _alone(
@@ -170,7 +178,7 @@ def _roots(trees: Sequence[str], inside: str) -> tuple[list[str], list[str]]:
     """Boundaries that are roots of trees, and equations that begin with them."""
     declared, equations = [], []
     for k, record in enumerate(trees):
-        rim, of, kind = f"{_RIM}r{k}", f"{inside}{record}", _kind_of(record)
+        rim, of, kind = f"{RIM}r{k}", f"{inside}{record}", _kind_of(record)
         assert kind is not None
         declared.append(f"{kind.connector} {rim};")
         root = f"{rim}{kind.ending}"
@@ -179,27 +187,40 @@ def _roots(trees: Sequence[str], inside: str) -> tuple[list[str], list[str]]:
     return declared, equations
 
 
-def _with_streams(flat: Json) -> Iterator[str]:
-    """The innermost connectors of the class that have streams."""
+def _with_semi_linear(dae: Json) -> bool:
+    """Whether the front end has put something else in the place of a semiLinear."""
+    return any(
+        p["origin"] == {"generated": "semi_linear_lowering"} for p in dae["storage"]["expressions"]["provenance"]
+    )
+
+
+def _connectors(flat: Json, prefix: str) -> Iterator[str]:
+    """The innermost connectors of the class that have variables with this prefix, flow or stream."""
     tops = {n.partition("[")[0] for n in flat["top_level_connectors"]}
-    found = [n.rpartition(".")[0] for n, v in flat["variables"].items() if v["stream"]]
+    found = [n.rpartition(".")[0] for n, v in flat["variables"].items() if v[prefix]]
     yield from (n for n in dict.fromkeys(found) if re.split(r"[.\[]", n)[0] in tops)
+
+
+def _in_graph(flat: Json, connector: str) -> bool:
+    """Whether a connector has an overdetermined record, which boundaries of another kind close."""
+    return any(v["is_overconstrained"] for n, v in flat["variables"].items() if n.startswith(f"{connector}."))
 
 
 def _rim(k: int, top: str, variables: Mapping[str, Json]) -> Iterator[str]:
     """A boundary for a connector: a connector with the same variables, and values of all but its flows."""
     declared, values = [], []
     for n, v in variables.items():
-        if not n.startswith(f"{top}.") or v["causality"] != "Empty":
+        # A connector may have parameters, such as a record of its medium.
+        if not n.startswith(f"{top}.") or v["causality"] != "Empty" or v["variability"] != "Empty":
             continue
         name, size = n[len(top) + 1 :], _size(n, variables)
         prefix = "flow " if v["flow"] else "stream " if v["stream"] else ""
         declared.append(f"{prefix}Real {name}{size};")
         if not v["flow"]:
             values.append(f"port.{name} = fill(z, {size[1:-1]});" if size else f"port.{name} = z;")
-    yield f"connector {_RIM}K{k} {' '.join(declared)} end {_RIM}K{k};"
-    yield f"model {_RIM}B{k} {_RIM}K{k} port; Real z = 0; equation {' '.join(values)} end {_RIM}B{k};"
-    yield f"{_RIM}B{k} {_RIM}{k};"
+    yield f"connector {RIM}K{k} {' '.join(declared)} end {RIM}K{k};"
+    yield f"model {RIM}B{k} {RIM}K{k} port; Real z = 0; equation {' '.join(values)} end {RIM}B{k};"
+    yield f"{RIM}B{k} {RIM}{k};"
 
 
 def _size(name: str, variables: Mapping[str, Json]) -> str:
@@ -218,11 +239,11 @@ def _inputs(dae: Json) -> Iterator[tuple[str, str]]:
 def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) -> Closed:
     """A flattened model with boundaries, under the names that the class has alone."""
     names = [v["name"] for v in found.dae["storage"]["variables"]]
-    outer = frozenset(n for n in names if not n.startswith((_INSIDE, _RIM)))
+    outer = frozenset(n for n in names if not n.startswith((INSIDE, RIM)))
 
     def under_own_names(of: Json, also: Mapping[str, str]) -> Json:
         # As text, since names stand in many lists of these records.
-        text = json.dumps(of).replace(f'"{_INSIDE}.', '"')
+        text = json.dumps(of).replace(f'"{INSIDE}.', '"')
         for before, after in also.items():
             text = text.replace(f'"{before}"', f'"{after}"')
         return json.loads(text)
@@ -230,7 +251,7 @@ def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) ->
     dae, told = under_own_names(found.dae, renamed), under_own_names(found.flat, {})
     flat: dict[str, Any] = {
         **told,
-        "top_level_connectors": [n for n in alone.flat["top_level_connectors"] if not n.startswith(_RIM)],
+        "top_level_connectors": [n for n in alone.flat["top_level_connectors"] if not n.startswith(RIM)],
         "model_description": alone.flat.get("model_description"),
     }
     for n, v in flat["variables"].items():
@@ -244,20 +265,22 @@ def _as_alone(found: Flattened, alone: Flattened, renamed: Mapping[str, str]) ->
             v["role"] = "input"
         if n in inputs or n in before and before[n]["role"] != "input":
             v["attributes"]["causality"] = before[n]["attributes"]["causality"]
-    return Closed(Flattened(found.name, dae, flat), outer, _edges(flat), tuple(flat["definite_roots"]))
+    return Closed(
+        Flattened(found.name, dae, flat), outer=outer, graph=_edges(flat), roots=tuple(flat["definite_roots"])
+    )
 
 
 def _edges(flat: Json) -> tuple[tuple[str, str], ...]:
     """The edges of trees that a class has inside."""
-    return tuple((a, b) for a, b in (*flat["branches"], *flat["optional_edges"]) if not a.startswith(_RIM))
+    return tuple((a, b) for a, b in (*flat["branches"], *flat["optional_edges"]) if not a.startswith(RIM))
 
 
 def without_boundaries(model: FlatModel, outer: frozenset[str]) -> FlatModel:
     """The model without what reads variables of boundaries, and without the variables of outer components that no
     equation of the class reads."""
     own = model.model
-    equations = [(e, set(_names(e))) for e in own.equations]
-    kept = [(e, names) for e, names in equations if not any(n.startswith(_RIM) for n in names)]
+    equations = [(e, set(_names(e))) for e in map(_without_rim, own.equations) if e is not None]
+    kept = [(e, names) for e, names in equations if not any(n.startswith(RIM) for n in names)]
     parameters = {d.name for d in own.declarations if d.prefixes & {"parameter", "constant"}}
     around = {n for d in own.declarations for n in [re.sub(r"\[[\d,]+\]$", "", d.name)] if n in outer} - parameters
     around -= {re.sub(r"\[[\d,]+\]$", "", n) for n in parameters}
@@ -271,15 +294,23 @@ def without_boundaries(model: FlatModel, outer: frozenset[str]) -> FlatModel:
     chosen = {id(e) for e, _ in mine}
     gone = around - read
     declarations = tuple(
-        d for d in own.declarations if not d.name.startswith(_RIM) and re.sub(r"\[[\d,]+\]$", "", d.name) not in gone
+        d for d in own.declarations if not d.name.startswith(RIM) and re.sub(r"\[[\d,]+\]$", "", d.name) not in gone
     )
-    initial = tuple(e for e in own.initial_equations if not any(n.startswith(_RIM) or n in gone for n in _names(e)))
+    initial = tuple(e for e in own.initial_equations if not any(n.startswith(RIM) or n in gone for n in _names(e)))
     left = own._replace(
         declarations=declarations,
-        equations=tuple(e for e in own.equations if id(e) in chosen),
+        equations=tuple(e for e, _ in equations if id(e) in chosen),
         initial_equations=initial,
     )
     return dataclasses.replace(model, model=left)
+
+
+def _without_rim(e: tree.Statement) -> tree.Statement | None:
+    """A `when` without what it does to boundaries; None if nothing is left of it."""
+    if not isinstance(e, tree.Branches) or e.kind != "when":
+        return e
+    bodies = [(c, tuple(s for s in body if not any(n.startswith(RIM) for n in _names(s)))) for c, body in e.branches]
+    return e._replace(branches=tuple(bodies)) if any(body for _, body in bodies) else None
 
 
 def _names(e: Any) -> Iterator[str]:

@@ -35,6 +35,19 @@ def _quotient(a: Value, b: Value) -> Value:
     return smooth(sympy.sign(q)) * sympy.floor(smooth(sympy.Abs(q)))
 
 
+DIVISIONS = ("div", "mod", "rem")
+
+
+def of_whole_numbers(name: str, a: sympy.Expr, b: int) -> Value:
+    """`div`, `mod` or `rem` of whole numbers by one that is not zero. The quotient is moved by half of the distance to
+    the next one: it is computed as a product with 1/b, and 49 (1/49) is less than one."""
+    half = sympy.Rational(1, 2)
+    if name == "mod":
+        return a - b * sympy.floor((a + half * _sign(b)) / b)
+    q = _sign(b) * smooth(sympy.sign(a)) * sympy.floor((smooth(sympy.Abs(a)) + half) / abs(b))
+    return q if name == "div" else a - q * b
+
+
 def _extreme(smaller: bool) -> Callable[..., Value]:
     """`min` or `max` of two values or of the entries of an array. As in Modelica it is not an event."""
     number, symbol = (min, sympy.Min) if smaller else (max, sympy.Max)
@@ -82,8 +95,10 @@ def product(value: Value) -> Value:
 
 
 def matrix_product(a: list, b: list) -> Value:
-    """The product of arrays of one or two dimensions."""
-    columns = sizes(a)[-1] if a else 0
+    """The product of arrays of one or two dimensions; that of two vectors without entries is zero."""
+    if not a:
+        return [] if b else 0.0
+    columns = sizes(a)[-1]
     if columns != len(b):
         raise ModelError(f"the product of arrays of sizes {sizes(a)} and {sizes(b)}: {columns} is not {len(b)}")
     if not isinstance(a[0], list):
@@ -152,7 +167,12 @@ def _linspace(first: Value, last: Value, count: int) -> list:
 
 
 def _size(value: Value, dimension: int | None = None) -> Value:
-    return sizes(value) if dimension is None else sizes(value)[int(dimension) - 1]
+    found = sizes(value)
+    if dimension is None:
+        return found
+    if not 1 <= dimension <= len(found):
+        raise ModelError(f"the size of dimension {dimension} of an array with the sizes {found}")
+    return found[int(dimension) - 1]
 
 
 def _integer(x: Value) -> Value:

@@ -12,9 +12,20 @@ from typing import Any
 from .builtin import FUNCTIONS
 from .flat_model import FlatModel
 from .sources import Constant, Found, Member, Sources
-from .tree import Call, Class, Comprehension, Declaration, Effect, Loop, Part, Reference, each_part
+from .tree import (
+    BUILT_IN,
+    Call,
+    Class,
+    Comprehension,
+    Declaration,
+    Effect,
+    Loop,
+    Part,
+    Reference,
+    Statement,
+    each_part,
+)
 
-_BUILT_IN = ("Real", "Integer", "Boolean", "String")
 _RECORDS = ("record", "class")
 
 
@@ -37,6 +48,14 @@ def completed(flat: FlatModel, library: Sources, known: frozenset[str]) -> FlatM
         if isinstance(found, Found):
             writer.write(found, name)
     return dataclasses.replace(flat, classes=classes)
+
+
+def definitions_written(
+    statements: tuple[Statement, ...], library: Sources, of: Found, local: frozenset[str], classes: dict[str, Class]
+) -> tuple[Statement, ...]:
+    """Statements of a class with full names for the functions, records and enumerations that they use, which are
+    written into `classes`, and with values for constants; `local` are names that stay."""
+    return _Writer(library, classes)._renamed(statements, of.inside, local)
 
 
 def _of_a_part(name: str, flat: FlatModel, library: Sources) -> Member | None:
@@ -108,12 +127,13 @@ class _Writer:
         )  # fmt: skip
 
     def _type(self, name: str, scopes: Sequence[Found]) -> tuple[str, tuple]:
-        """(A built-in type or the name of a record or enumeration, dimensions that belong to the type)."""
-        if name in _BUILT_IN:
+        """(A built-in type or the name of a record or enumeration, dimensions that belong to the type); the name as it
+        is for a type that no source holds."""
+        if name in BUILT_IN:
             return name, ()
         found = self.library.class_of(name, scopes)
         if found is None:
-            return "Real", ()
+            return name, ()  # it may be an array
         alias = found.source.alias
         if alias is not None:
             kind, more = self._type(alias.type, found.scopes)

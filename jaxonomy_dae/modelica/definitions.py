@@ -42,11 +42,15 @@ class DiscreteDefinitions:
 
 def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> DiscreteDefinitions:
     """Splits the statements of a model."""
-    whens = list(_whens_in(model.equations))
+    whens = list(whens_in(model.equations))
     rest = [s for s in model.equations if s not in whens] if whens else list(model.equations)
-    others = _with_choices(_by_entries(rest, model, is_discrete), is_discrete)
-    sections = [section for section in model.algorithms if any(_whens_in(section))]
-    by_when = set(with_entries(assigned_in((*whens, *(w for section in sections for w in _whens_in(section)))), model))
+
+    def by_entries(statements: Iterable[tree.Statement]) -> Iterator[tree.Statement]:
+        return _by_entries(statements, model, is_discrete)
+
+    others = _with_choices(by_entries(rest), is_discrete, by_entries)
+    sections = [section for section in model.algorithms if any(whens_in(section))]
+    by_when = set(with_entries(assigned_in((*whens, *(w for section in sections for w in whens_in(section)))), model))
     # In an algorithm with a when, what stands outside of it is kept, too: statements before and after read each other.
     by_when |= {n for section in sections for n in with_entries(assigned_in(section), model) if is_discrete(n)}
     algorithms = []
@@ -65,8 +69,8 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
     types = {d.name: d.type for d in model.declarations}
     candidates = [(s, _definable(s, is_discrete, given, types)) for s in [*others, *bindings]]
     equations: list[tree.Statement] = [s for s, sides in candidates if not sides]
-    matched, left = _matched([(s, sides) for s, sides in candidates if sides], is_discrete)
-    of: dict[str, tree.Expression | int] = {**matched}
+    found, left = matched([(s, sides) for s, sides in candidates if sides], is_discrete)
+    of: dict[str, tree.Expression | int] = {**found}
     equations += left
     assigned = []
     for k, section in enumerate(algorithms):
@@ -79,30 +83,31 @@ def find_definitions(model: tree.Class, is_discrete: Callable[[str], bool]) -> D
                 of[name] = k
             else:
                 equations.append(tree.Equality(tree.Reference((name,)), OfAlgorithm(k, name), section[0].line))  # type: ignore[arg-type]
-    read_before = set(with_entries(_read_before((model.equations, model.algorithms, tuple(bindings))), model))
+    read = set(with_entries(read_before((model.equations, model.algorithms, tuple(bindings))), model))
     for section in algorithms:
-        read_before |= {n for n in remembered(section, model) if is_discrete(n)}
-    followed = [name for name in of if name in read_before and name not in by_when]
+        read |= {n for n in remembered(section, model) if is_discrete(n)}
+    followed = [name for name in of if name in read and name not in by_when]
     return DiscreteDefinitions(
         of=of, stored=by_when | set(followed), followed=followed, equations=equations, whens=whens, sections=sections,
         initial=list(model.initial_equations), algorithms=algorithms, assigned=assigned,
     )  # fmt: skip
 
 
-def _whens_in(statements: Iterable[tree.Statement]) -> Iterator[tree.Branches]:
+def whens_in(statements: Iterable[tree.Statement]) -> Iterator[tree.Branches]:
     return (s for s in statements if isinstance(s, tree.Branches) and s.kind == "when")
 
 
 def _by_entries(
     statements: Iterable[tree.Statement], model: tree.Class, is_discrete: Callable[[str], bool]
 ) -> Iterator[tree.Statement]:
-    """The statements with an equation for each entry of a discrete array that stands alone on the left."""
+    """The statements with an equation for each entry of a discrete array that stands alone on the left, and for each
+    discrete result of a function."""
     places: dict[str, list[str]] = {}
     for d in model.declarations:
         array, _, place = d.name.rpartition("[")
         if array and is_discrete(d.name):
             places.setdefault(array, []).append(place[:-1])
-    for s in statements:
+    for s in _by_results(statements, lambda name: is_discrete(name) or name in places):
         if not (isinstance(s, tree.Equality) and isinstance(s.left, tree.Reference)):
             yield s
             continue
@@ -110,8 +115,30 @@ def _by_entries(
             yield s
             continue
         for place in places[s.left.path]:
-            entry = _entry_of(s.right, [int(k) for k in place.split(",")])
+            other = s.right.path if isinstance(s.right, tree.Reference) and not any(s.right.subscripts) else ""
+            if place in places.get(other, ()):
+                entry: tree.Expression = tree.Reference((f"{other}[{place}]",))
+            else:
+                entry = _entry_of(s.right, [int(k) for k in place.split(",")])
             yield tree.Equality(tree.Reference((f"{s.left.path}[{place}]",)), entry, s.line)
+
+
+def _by_results(
+    statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool]
+) -> Iterator[tree.Statement]:  # fmt: skip
+    for s in statements:
+        if not (isinstance(s, tree.Equality) and isinstance(s.left, tree.Several)):
+            yield s
+            continue
+        others: list[tree.Expression | None] = []
+        for k, e in enumerate(s.left.entries):
+            if isinstance(e, tree.Reference) and is_discrete(_name(e)):
+                others.append(None)
+                yield tree.Equality(e, tree.Result(s.right, k), s.line)
+            else:
+                others.append(e)
+        if any(e is not None for e in others):
+            yield s._replace(left=tree.Several(tuple(others)))
 
 
 def _entry_of(e: tree.Expression, place: list[int]) -> tree.Expression:
@@ -124,7 +151,10 @@ def _entry_of(e: tree.Expression, place: list[int]) -> tree.Expression:
     return tree.Part(e, None, tuple(map(tree.Number, place)))
 
 
-def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool]) -> list[tree.Statement]:
+def _with_choices(
+    statements: Iterable[tree.Statement], is_discrete: Callable[[str], bool],
+    by_entries: Callable[[Iterable[tree.Statement]], Iterable[tree.Statement]],
+) -> list[tree.Statement]:  # fmt: skip
     """The statements with an equation for each discrete variable that all branches of an `if` determine."""
     out: list[tree.Statement] = []
     for s in statements:
@@ -132,7 +162,7 @@ def _with_choices(statements: Iterable[tree.Statement], is_discrete: Callable[[s
             out.append(s)
             continue
         conditions = [c for c, _ in s.branches]
-        bodies = [_with_choices(body, is_discrete) for _, body in s.branches]
+        bodies = [_with_choices(by_entries(body), is_discrete, by_entries) for _, body in s.branches]
         values = [
             {_name(e.left): e.right for e in body
              if isinstance(e, tree.Equality) and isinstance(e.left, tree.Reference) and is_discrete(_name(e.left))}
@@ -169,7 +199,7 @@ def _definable(
     return out
 
 
-def _matched(
+def matched(
     candidates: list[tuple[tree.Statement, list[tuple[str, tree.Expression]]]], is_discrete: Callable[[str], bool]
 ) -> tuple[dict[str, tree.Expression], list[tree.Statement]]:
     """(One equation for each variable, by augmenting paths; equations that are left, of continuous variables)."""
@@ -282,7 +312,7 @@ def with_entries(names: Iterable[str], model: tree.Class) -> list[str]:
     return list(out)
 
 
-def _read_before(statement: object) -> Iterator[str]:
+def read_before(statement: object) -> Iterator[str]:
     """The names in pre(…), edge(…) and change(…)."""
     for e in tree.each_part(statement):
         if (

@@ -10,7 +10,16 @@ import sympy
 from ..base.errors import ModelError
 from ..write.symbols import VariableSymbol, der
 from . import tree
-from .builtin import FUNCTIONS, applied, matrix_power, matrix_product, numbers_checked, rows_joined
+from .builtin import (
+    DIVISIONS,
+    FUNCTIONS,
+    applied,
+    matrix_power,
+    matrix_product,
+    numbers_checked,
+    of_whole_numbers,
+    rows_joined,
+)  # fmt: skip
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, moves, of_complex_numbers
 from .read_expressions import FUNCTION
@@ -59,13 +68,16 @@ class Evaluator:
         named: Callable[[sympy.Expr], Value] = lambda e: e,
         opaque: Callable[[Callable, Sequence[Value], int, str], Sequence[Value]] = lambda *_: (),
     ):
-        self.classes, self.names, self.entries = classes, names, entries or {}
+        self.classes, self.names = classes, names
+        self.entries = {} if entries is None else entries  # an empty one may be filled later
         self.special, self.externals = special, externals
         self.literals = literal_numbers(classes)
         self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
         self.quieted = Quieted()
         self.named, self.opaque = named, opaque
+        self.is_integer: Callable[[str], bool] = lambda name: False  # true for Integer variables
         self.depth = 0
+        self.around = names  # where a special call stands: the iterators of loops are among them
         self.guards: list[Value] = []  # conditions that are not constant, around what is carried out
 
     # --- expressions -------------------------------------------------------------------------------------------------
@@ -80,10 +92,14 @@ class Evaluator:
         return _EVALUATED[type(e)](self, e, names or self.names)
 
     def _reference(self, e: tree.Reference, names: Names) -> Value:
+        return self.referred(e, names, names)
+
+    def referred(self, e: tree.Reference, names: Names, inside: Names) -> Value:
+        """What a reference stands for; `inside` are the names in its subscripts."""
         path = e.path
         if path in self.literals:
             return self.literals[path]
-        written = self._entry_name(e, names) if any(e.subscripts) else path
+        written = self._entry_name(e, inside) if any(e.subscripts) else path
         if written is not None:
             try:
                 return names(written)
@@ -97,11 +113,39 @@ class Evaluator:
                 continue
             if any(e.subscripts[: n - 1]):
                 continue
-            value = self._entry(value, e.subscripts[n - 1], names)
+            value = self._entry(value, e.subscripts[n - 1], inside)
             for field, subscripts in zip(e.parts[n:], e.subscripts[n:], strict=True):
-                value = self._entry(_field(value, field), subscripts, names)
+                value = self._entry(_field(value, field), subscripts, inside)
             return value
-        raise ModelError(f"'{e.path}' is not declared")
+        if path == "Boolean":
+            return [False, True]
+        if path in self.classes and self.classes[path].literals:  # all values of an enumeration, as in `for e in E`
+            return list(range(1, len(self.classes[path].literals) + 1))
+        raise ModelError(f"'{path}' is not declared")
+
+    def count(self, dimension: tree.Expression, names: Names | None = None) -> int:
+        """The size of a dimension: a number, or that of an enumeration."""
+        found = self.constant(dimension, names)
+        return len(found) if isinstance(found, list) else int(found)
+
+    def local_names(self, local: Mapping[str, Value], outer: Names) -> Names:
+        """The names in a function or algorithm: those of `local` hide others."""
+
+        def names(name: str) -> Value:
+            if name in local:
+                value = local[name]
+                if value is None:
+                    raise ModelError(f"'{name}' is read before it is assigned")
+                return value
+            # An entry or a field of a local variable is not that of a variable of the model with the same name.
+            if beginning(name) in local:
+                raise KeyError(name)
+            places = self.entries.get(name, ())
+            if any(tree.entry_name(name, p) in local for p in places):  # an algorithm has assigned some of them
+                return array_of(name, places, names)
+            return outer(name)
+
+        return names
 
     def name_of(self, e: tree.Reference) -> str:
         """The name of a variable that is declared by itself, an entry of an array among them."""
@@ -232,6 +276,8 @@ class Evaluator:
 
     def _range(self, e: tree.Range, names: Names) -> list:
         first, step, last = (self.constant(x, names) for x in (e.first, e.step, e.last))
+        if isinstance(first, bool):
+            return [b for b in (False, True) if first <= b <= last]
         if step == 0:
             raise ModelError(f"the range {first}:0:{last} has no step")
         count = math.floor(round((last - first) / step, 6)) + 1  # rounding: 0.3 / 0.1 is below 3
@@ -255,25 +301,44 @@ class Evaluator:
 
     def _call(self, e: tree.Call, names: Names) -> Value:
         name = e.function
+        if name in self.classes:  # a function of the text hides one that is built in
+            return self.call(name, *self._arguments(e, names))
         if name in self.special:
-            return self.special[name](*e.arguments)
+            before, self.around = self.around, names
+            try:
+                return self.special[name](*e.arguments)
+            finally:
+                self.around = before
         if name in ("noEvent", "smooth"):
             return self._without_events(e, names)
         if name == FUNCTION:
             return self._applied(e.arguments[0], names)
         if name == "der":
             return entrywise(der, self.evaluate(e.arguments[0], names))
-        arguments = [self.evaluate(a, names) for a in e.arguments]
-        named = {k: self.evaluate(v, names) for k, v in e.named}
+        arguments, named = self._arguments(e, names)
+        if name in DIVISIONS and len(arguments) == 2 and not named:
+            a, b = arguments
+            if isinstance(a, sympy.Expr) and isinstance(b, int) and b and self._is_whole(a):
+                return of_whole_numbers(name, a, b)
         if name in FUNCTIONS:
             return applied(name, arguments, named)
         # A function that is an argument is called by the argument's name.
-        if name not in self.classes and "." not in name:
+        if "." not in name:
             try:
                 return names(name)(*arguments, **named)
             except KeyError:
                 pass
         return self.call(name, arguments, named)
+
+    def _is_whole(self, value: sympy.Expr) -> bool:
+        """True for what is seen to be a whole number: sums, products and choices of Integer variables."""
+        parts = sympy.preorder_traversal(value)
+        return all(
+            p.is_Integer if p.is_Number else self.is_integer(str(p)) if p.is_Symbol else not p.is_Pow for p in parts
+        )
+
+    def _arguments(self, e: tree.Call, names: Names) -> tuple[list[Value], dict[str, Value]]:
+        return [self.evaluate(a, names) for a in e.arguments], {k: self.evaluate(v, names) for k, v in e.named}
 
     def _without_events(self, e: tree.Call, names: Names) -> Value:
         if e.function == "smooth" and self.constant(e.arguments[0], names) == 0:
@@ -321,6 +386,7 @@ def _field(value: Value, name: str) -> Value:
 
 
 def index_of(k: Value, count: int) -> int:
+    k = k + 1 if isinstance(k, bool) else k  # of a dimension that is Boolean
     if not (float(k).is_integer() and 1 <= k <= count):
         raise ModelError(f"the subscript {k} is outside of 1:{count}")
     return int(k) - 1
@@ -334,16 +400,21 @@ def with_end(names: Names, count: int) -> Names:
     return _with(names, "end", count)
 
 
-def local_names(local: Mapping[str, Value], outer: Names) -> Names:
-    def names(name: str) -> Value:
-        if name in local:
-            value = local[name]
-            if value is None:
-                raise ModelError(f"'{name}' is read before it is assigned")
-            return value
-        return outer(name)
+def array_of(name: str, places: Sequence[tuple[int, ...]], value_of: Names, depth: int = 0) -> list:
+    """The array of the entries at these places, which have equal numbers before `depth`."""
+    out = []
+    for k in sorted({p[depth] for p in places}):
+        inside = [p for p in places if p[depth] == k]
+        if len(inside[0]) > depth + 1:
+            out.append(array_of(name, inside, value_of, depth + 1))
+        else:
+            out.append(value_of(tree.entry_name(name, inside[0])))
+    return out
 
-    return names
+
+def beginning(name: str) -> str:
+    """The first part of a name, without its subscripts."""
+    return name.partition("[")[0].partition(".")[0]
 
 
 def _refused(_: Evaluator, e: object, __: Names) -> NoReturn:
@@ -366,6 +437,7 @@ _EVALUATED: dict[type, Callable[[Evaluator, Any, Names], Value]] = {
     tree.Comprehension: Evaluator._comprehension,
     tree.Part: Evaluator._part,
     tree.Several: lambda self, e, names: [None if x is None else self.evaluate(x, names) for x in e.entries],
+    tree.Result: lambda self, e, names: self.results(e.call, names)[e.number],
     tree.Whole: _refused,
 }
 

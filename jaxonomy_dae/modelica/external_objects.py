@@ -68,8 +68,13 @@ def _expression(e: Json, ordinals: Mapping[str, int]) -> tree.Expression:
         return tree.Call(_name(inside), each(inside["args"]), ())
     if kind == "BuiltinCall":
         return tree.Call(inside["function"].lower(), each(inside["args"]), ())
+    if kind == "Unary" and "Not" in inside["op"]:
+        return tree.Unary("not", _expression(inside["rhs"], ordinals))
     if kind == "Unary" and "Minus" in inside["op"]:
         return tree.Unary("-", _expression(inside["rhs"], ordinals))
+    if kind == "If":
+        branches = tuple((_expression(c, ordinals), _expression(value, ordinals)) for c, value in inside["branches"])
+        return tree.Choice(branches, _expression(inside["else_branch"], ordinals))
     if kind == "Binary":
         return tree.Binary(_BINARY[inside["op"]], *each([inside["lhs"], inside["rhs"]]))
     raise KeyError(f"an expression of the kind '{kind}'")

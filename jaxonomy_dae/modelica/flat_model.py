@@ -7,7 +7,7 @@ from typing import Any
 from ..base.errors import ModelError
 from .learned_law import Law, law_of
 from .read_expressions import INSIDE, written
-from .tree import Class, Number, Reference
+from .tree import Array, Call, Class, Declaration, Number, Reference
 
 PREFERRED = ("StateSelect.prefer", "StateSelect.always")
 
@@ -78,7 +78,33 @@ def flat_of(outermost: Class) -> FlatModel:
     if len(models) != 1:
         raise ModelError(f"a flat text holds one model; '{outermost.name}' holds {len(models)}")
     classes = {name: c for name, c in outermost.classes.items() if c is not models[0]}
-    return FlatModel(_with_numbers(models[0], literal_numbers(classes)), classes)
+    model = models[0]._replace(declarations=outermost.declarations + models[0].declarations)  # constants of the package
+    model = _with_numbers(model, literal_numbers(classes))
+    return FlatModel(_with_types(model, classes), {name: _with_types(c, classes) for name, c in classes.items()})
+
+
+def _with_types(c: Class, classes: Mapping[str, Class]) -> Class:
+    return c._replace(declarations=tuple(_with_type(d, classes) for d in c.declarations)) if c.declarations else c
+
+
+def _with_type(d: Declaration, classes: Mapping[str, Class]) -> Declaration:
+    """A declaration with the modifiers and the dimensions of its type, where it has none of its own."""
+    of = classes.get(d.type)
+    alias = None if of is None or of.kind != "type" else of.alias or _base(of)
+    if alias is None:
+        return d
+    alias = _with_type(alias, classes)
+    # An array in the modifiers of a type is one of an entry of d.
+    shared = {
+        k: Call("fill", (v, *d.dimensions), ()) if d.dimensions and isinstance(v, Array) else v
+        for k, v in alias.modifiers.items()
+    }
+    return d._replace(modifiers=shared | d.modifiers, dimensions=d.dimensions + alias.dimensions)
+
+
+def _base(of: Class) -> Declaration | None:
+    """The type that a type extends, with its modifiers."""
+    return next((Declaration(frozenset(), b, of.name, (), more, None, "", 0) for b, more in of.bases), None)
 
 
 def literal_numbers(classes: Mapping[str, Class]) -> dict[str, int]:

@@ -23,6 +23,11 @@ _UNROOTED = re.compile(
 _DECIDES = re.compile(
     r"not parameter-evaluable: unknown variable: ([\w.]+)|unresolved component dimension for [\w.]+: (\w+)"
 )
+_CONDITION = re.compile(r"conditional component `([\w.]+)` requires parameter expression")
+_UNCLOCKED = re.compile(
+    r"unresolved clock schedule|no exact connected clock owner|no inferred clock constructor"
+    r"|must belong to a proven clock partition|the required exact clock owner|requires an owning clocked when-clause"
+)
 _NOT_LOADED = re.compile(r"Failed to load source root")
 _CLASS = re.compile(r"\b(?:model|class|block)\s+(\w+)")
 
@@ -41,6 +46,10 @@ class Unbalanced(ModelError):
     def __init__(self, message: str, missing: int):
         super().__init__(message)
         self.missing = missing
+
+
+class Unclocked(ModelError):
+    """Nothing in a model says when a clock ticks."""
 
 
 class Flattened(NamedTuple):
@@ -88,7 +97,7 @@ class FrontEnd:
                 ) from None
             if counts := _UNBALANCED.search(str(error)):
                 raise Unbalanced(said, int(counts[2]) - int(counts[1])) from None
-            raise ModelError(said) from None
+            raise (Unclocked if _UNCLOCKED.search(str(error)) else ModelError)(said) from None
         except BaseException as error:
             if type(error).__name__ != "PanicException":  # of a Rust library: no Exception, and not importable
                 raise
@@ -145,6 +154,11 @@ class FrontEnd:
             which = "are too many" if equations > unknowns else "lack one"
             counts = f"{_count(equations, 'equation')} for {_count(unknowns, 'unknown')}"
             return f"'{called or last}' has {counts}; rumoca does not say which of them {which}"
+        if found := _CONDITION.search(error):
+            return (
+                f"nothing says whether there is a '{found[1]}': the class gives no value to the parameter that decides "
+                "it; component(…, parameter=True)"
+            )
         if found := _DECIDES.search(error):
             name = found[1] or found[2]
             return f"the class gives no value to '{name}', which decides its equations: component(…, {name}=…)"

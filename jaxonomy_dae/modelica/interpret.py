@@ -10,10 +10,11 @@ from itertools import islice
 import sympy
 
 from ..base.errors import ModelError, nearest
+from ..write.automatic_events import smooth
 from . import tree
-from .builtin import FUNCTIONS, applied, filled
+from .builtin import FUNCTIONS, applied, filled, sizes
 from .definitions import assigned_in
-from .evaluate import Evaluator, Names, index_of, local_names, with_end
+from .evaluate import Evaluator, Names, beginning, index_of, with_end
 from .loops import JUMPS, MOST, at, carried, placed, repeated
 from .values import Record, Results, Value, as_number, both, chosen, either, is_condition, negated
 
@@ -41,40 +42,82 @@ class Interpreter(Evaluator):
             more = "; load(…, roots=[…]) reads it from the sources of its library" if "." in name else ""
             near = nearest(name, [*FUNCTIONS, *self.classes])
             raise ModelError(f"the function '{name}' is not known: {near}{more}")
+        if function.kind == "record":
+            return self._record(function, arguments, named)
         inputs = [d for d in function.declarations if "input" in d.prefixes]
-        if function.kind == "record":
-            inputs = list(function.declarations)
         given = dict(zip((d.name for d in inputs), arguments, strict=False)) | named
-        if function.kind == "record":
-            return Record({d.name: self._input(d, given, given) for d in inputs})
         if function.external is not None:
             external = self.externals.get(function.external)
             if external is None:
                 raise ModelError(f"the function '{name}' calls '{function.external}', which is written in C")
-            return external(*(self._input(d, given, given) for d in inputs))
-        return self._carried_out(function, inputs, given)
+            local, _ = self._declared(tuple(inputs), given)
+            return external(*(local[d.name] for d in inputs))
+        known = [d for d in inputs if d.name in given and (d.type in tree.BUILT_IN or d.type in self.classes)]
+        arrays = {d.name for d in known if len(sizes(given[d.name])) > len(d.dimensions)}
+        return self._for_entries(name, given, arrays) if arrays else self._carried_out(function, given)
 
-    def _input(self, d: tree.Declaration, given: dict[str, Value], known: Mapping[str, Value]) -> Value:
-        if d.name in given:
-            return given[d.name]
-        if d.value is None:
-            raise ModelError(f"the argument '{d.name}' is missing")
-        return self.evaluate(d.value, local_names(known, self.names))
+    def _record(self, record: tree.Class, arguments: list[Value], named: dict[str, Value]) -> Record:
+        """A record from the values of its fields. Those that cannot be modified are not arguments (section 12.6), but
+        front ends may write all fields of a record that they have computed."""
+        fields = [d.name for d in record.declarations]
+        if len(arguments) < len(fields):
+            fixed = {d.name for d in record.declarations if d.value is not None and d.prefixes & {"constant", "final"}}
+            fields = [name for name in fields if name not in fixed]
+        given = dict(zip(fields, arguments, strict=False)) | named
+        for d in record.declarations:
+            if d.name not in given and d.value is None:
+                raise ModelError(f"the argument '{d.name}' is missing")
+        local, _ = self._declared(record.declarations, given)
+        return Record({d.name: local[d.name] for d in record.declarations})
 
-    def _carried_out(self, function: tree.Class, inputs: list[tree.Declaration], given: dict[str, Value]) -> Value:
+    def _for_entries(self, name: str, given: dict[str, Value], arrays: set[str]) -> Value:
+        """A function whose arguments have more dimensions than it declares is applied to their entries (section
+        12.4.6)."""
+        counts = {len(given[a]) for a in arrays}
+        if len(counts) > 1:
+            raise ModelError(f"'{name}' of arrays of {' and '.join(map(str, sorted(counts)))} entries")
+        found = [self.call(name, [], given | {a: given[a][k] for a in arrays}) for k in range(counts.pop())]
+        if found and isinstance(found[0], Results):
+            return Results(map(list, zip(*found, strict=True)))
+        return found
+
+    def _declared(
+        self, declarations: tuple[tree.Declaration, ...], given: dict[str, Value]
+    ) -> tuple[dict[str, Value], Names]:
+        """The first values of the variables of a function or record, and a view of all names; a variable whose value
+        reads another one comes after it, wherever that is declared (section 12.4.4)."""
+        local: dict[str, Value] = {}
+        waiting = {d.name: d for d in declarations}
+        inner = self.local_names(local, self.names)
+
+        def names(name: str) -> Value:
+            settle(beginning(name))
+            return inner(name)
+
+        def settle(name: str) -> None:
+            d = waiting.pop(name, None)
+            if d is None:
+                return
+            local[name] = None  # while its own value is looked for
+            if name in given:
+                local[name] = self._named(given[name])
+            elif d.value is not None:
+                local[name] = self._named(self.evaluate(d.value, names))
+            elif "input" in d.prefixes:
+                raise ModelError(f"the argument '{name}' is missing")
+            else:
+                local[name] = self._unset(d, names)
+
+        for d in declarations:
+            settle(d.name)
+        return local, names
+
+    def _carried_out(self, function: tree.Class, given: dict[str, Value]) -> Value:
         if self.depth > DEEPEST:
             raise ModelError(f"the function '{function.name}' calls itself too often")
         before, guards, self.quiet, self.depth = self.quiet, len(self.guards), True, self.depth + 1
-        local: dict[str, Value] = {}
-        names = local_names(local, self.names)
         try:
-            for d in function.declarations:
-                if "input" in d.prefixes:
-                    local[d.name] = self._named(self._input(d, given, local))
-                elif d.value is not None:
-                    local[d.name] = self._named(self.evaluate(d.value, names))
-                else:
-                    local[d.name] = self._unset(d, names)
+            local, names = self._declared(function.declarations, given)
             for statements in function.algorithms:
                 self.execute(statements, local, names)
         except ModelError as error:
@@ -105,7 +148,7 @@ class Interpreter(Evaluator):
         for dimension in d.dimensions:
             if isinstance(dimension, tree.Whole):
                 return None
-            counts.append(self.constant(dimension, names))
+            counts.append(self.count(dimension, names))
         if isinstance(empty, Record):
             one = d._replace(dimensions=d.dimensions[1:])
             return [self._unset(one, names) for _ in range(counts[0])] if counts else empty
@@ -116,7 +159,7 @@ class Interpreter(Evaluator):
     def assigned_by(self, statements: tuple[tree.Statement, ...], first: Mapping[str, Value] | None = None) -> dict:
         """What an algorithm of the model assigns; `first` are values before it."""
         local: dict[str, Value] = dict(first or {})
-        self.execute(statements, local, lambda name: local[name] if name in local else self.names(name))
+        self.execute(statements, local, self.local_names(local, self.names))
         return local
 
     def execute(self, statements: tuple[tree.Statement, ...], local: dict[str, Value], names: Names) -> None:
@@ -134,7 +177,7 @@ class Interpreter(Evaluator):
                 continue
             copied = dict(local)
             self.guards.append(negated(ended))
-            self._statement(s, copied, local_names(copied, names))
+            self._statement(s, copied, self.local_names(copied, names))
             self.guards.pop()
             self._join(ended, dict(local), copied, local)
 
@@ -152,9 +195,19 @@ class Interpreter(Evaluator):
 
     def _join(self, condition: Value, a: dict[str, Value], b: dict[str, Value], local: dict[str, Value]) -> None:
         """Assigns what two branches assign: that of `a` where the condition holds."""
+        quiet = self.quiet or condition in self.quieted
         for name in a | b:
             otherwise = False if name in ("return", "break") else local.get(name)
-            local[name] = self._named(_joined(condition, a.get(name, otherwise), b.get(name, otherwise), self.quiet))
+            joined = _joined(condition, a.get(name, otherwise), b.get(name, otherwise), quiet)
+            local[name] = self._named_truth(joined) if name in JUMPS else self._named(joined)
+
+    def _named_truth(self, value: Value) -> Value:
+        """Whether a jump has happened, by a name for what is long: all that follows asks for it."""
+        if isinstance(value, bool):
+            return value
+        number = smooth(as_number(value))
+        named = self._named(number)
+        return value if named is number else sympy.Eq(named, 1)
 
     def _assign(self, target: tree.Expression, value: Value, local: dict[str, Value], names: Names) -> None:
         if isinstance(target, tree.Several):
@@ -220,7 +273,7 @@ class Interpreter(Evaluator):
             for condition, statements in ((holds, body), (negated(holds), (rest,))):
                 copied = dict(local)
                 self.guards.append(condition)
-                self.execute(statements, copied, local_names(copied, names))
+                self.execute(statements, copied, self.local_names(copied, names))
                 self.guards.pop()
                 results.append(copied)
             self._join(holds, results[0], results[1], local)
@@ -236,7 +289,9 @@ class Interpreter(Evaluator):
 
     def _while(self, s: tree.Loop, condition: tree.Expression, local: dict[str, Value], names: Names) -> None:
         for _ in range(MOST_ROUNDS):
-            holds = both(self.evaluate(condition, names), negated(either(*(local.get(j, False) for j in JUMPS))))
+            # Behind a jump the condition need not have a value, as one that reads the entry after the last one.
+            ended = either(*(local.get(j, False) for j in JUMPS))
+            holds = ended is not True and both(self.evaluate(condition, names), negated(ended))
             if not isinstance(holds, bool):
                 self._repeated(s, condition, local, names)
                 return
@@ -259,7 +314,7 @@ class Interpreter(Evaluator):
         # Names would be equations of the model, outside of the loop, where what a round reads has no value.
         named, guards, self.named, self.guards = self.named, self.guards, lambda e: e, []
         try:
-            within = local_names(inside, names)
+            within = self.local_names(inside, names)
             ended = either(*(inside.get(j, False) for j in JUMPS))
             goes_on = both(self.evaluate(condition, within), negated(ended))
             self.execute(body, inside, within)

@@ -105,6 +105,7 @@ def time_table_coefficients(
     return chosen(RELATIONS["<"](time + margin, start), [0.0, offset, start, last], out, quiet=True)
 
 
+TIME_TABLE = "Modelica.Blocks.Sources.TimeTable.getInterpolationCoefficients"
 LEFT_OUT: dict[str, Callable[..., Value]] = {
     "Modelica.Math.Vectors.length": _length,
     "Modelica.Math.Vectors.normalize": _normalized,
@@ -128,5 +129,5 @@ LEFT_OUT: dict[str, Callable[..., Value]] = {
     "Modelica.Math.Special.erfInv": of_numbers(scipy.special.erfinv, sympy.erfinv),
     "Modelica.Math.Matrices.leastSquares": _least_squares,
     "Modelica.Utilities.Strings.substring": lambda text, first, last: text[first - 1 : last],
-    "getInterpolationCoefficients": time_table_coefficients,
+    TIME_TABLE.rpartition(".")[2]: time_table_coefficients,
 }

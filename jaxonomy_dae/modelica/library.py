@@ -1,15 +1,18 @@
 """Modelica libraries, whose classes are classes of components."""
 
 import functools
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import ModelError, nearest
+from . import tree
 from .balance import balance
 from .boundaries import flattened
-from .front_end import FrontEnd, Unbalanced
+from .clocked_boundaries import Signal, signals_of, with_clock
+from .front_end import FrontEnd, Unbalanced, Unclocked
 from .modification import modification
 from .open_class import OpenClass, opened
 from .open_component import OpenComponent
@@ -45,7 +48,7 @@ class Library:
             raise ModelError(f"roots: there is no '{missing[0]}'")
         self.shelf = Shelf([Path(root) for root in each])
         self.sources = [Path(root) for root in each if Path(root).suffix != ".zip"]
-        self._classes: dict[tuple[str, str, str], type[OpenComponent]] = {}
+        self._classes: dict[tuple[str, str, str, float | None], type[OpenComponent]] = {}
 
     @functools.cached_property
     def front_end(self) -> FrontEnd:
@@ -59,25 +62,30 @@ class Library:
     def __getitem__(self, name: str) -> type[OpenComponent]:
         return self.component(name)
 
-    def component(self, name: str, *texts: str, source: str | None = None, **modifications: Any) -> type[OpenComponent]:
+    def component(
+        self, name: str, *texts: str, source: str | None = None, clock: float | None = None, **modifications: Any
+    ) -> type[OpenComponent]:
         """A class of the library as a class of components; the arguments are those of `component`."""
         changes = modification(texts, modifications)
-        key = name, changes, source or ""
+        if clock is not None and not (isinstance(clock, int | float) and 0 < clock < math.inf):
+            raise ModelError(f"clock: the seconds between two ticks are a positive number; got {clock!r}")
+        key = name, changes, source or "", clock
         if key not in self._classes:
-            found = self.opened(name, changes, source)
+            found = self.opened(name, changes, source, clock)
             _check_modified(found, {**_named_in(texts), **modifications})
             self._classes[key] = component_of(found)
         return self._classes[key]
 
-    def opened(self, name: str, changes: str = "", source: str | None = None) -> OpenClass:
-        """What is known of a class with modifications, given as text."""
-        found = self.shelf.find(name, changes, source or "")
+    def opened(self, name: str, changes: str = "", source: str | None = None, clock: float | None = None) -> OpenClass:
+        """What is known of a class with modifications, given as text, and with seconds between ticks of its clock."""
+        told = f"{changes}; Clock({clock!r})" if clock is not None else changes
+        found = self.shelf.find(name, told, source or "")
         if found is None:
-            found = self._flattened(name, changes, source)
-            self.shelf.keep(found, name, changes, source or "")
+            found = self._flattened(name, changes, source, clock)
+            self.shelf.keep(found, name, told, source or "")
         return found
 
-    def _flattened(self, name: str, changes: str, source: str | None) -> OpenClass:
+    def _flattened(self, name: str, changes: str, source: str | None, clock: float | None) -> OpenClass:
         if not self.sources and source is None:
             packed = self.shelf.names()
             if name in packed:
@@ -90,11 +98,27 @@ class Library:
             raise ModelError(f"there is no class '{name}' in {self.shelf}: {nearest(name, packed)}")
         if source is None:
             self._check_known(name)
+        if clock is not None:
+            signals = self._signals(name, source)
+            try:
+                closed = with_clock(self.front_end, name, changes, source, signals, float(clock))
+            except Unclocked as error:
+                raise ModelError(
+                    f"'{name}': one clock does not say when all of its clocks tick; parameters of the class may say "
+                    f"how they are related, as inferFactor=False, factor=2 do: {error}"
+                ) from None
+            return opened(name, closed, self._names)
         # Records are read from the sources only if the front end misses equations: it takes a search through files.
         try:
-            return opened(
-                name, flattened(self.front_end, name, changes, source, functools.partial(self._records, name, source))
-            )
+            records, counted = functools.partial(self._records, name, source), self._counted(name, source)
+            closed = flattened(self.front_end, name, changes, source, records, counted)
+            return opened(name, closed, self._names)
+        except Unclocked:
+            raise ModelError(
+                f"'{name}': its surroundings decide when its clock ticks. component(…, clock=0.1) opens it with a "
+                "clock that ticks every 0.1 s, which samples its inputs. Blocks of one clock that read each other at a "
+                "tick are a part of a model that opens as a whole: component(name, source=text, roots=[…])"
+            ) from None
         except Unbalanced as error:
             found = self._names.find(name) if source is None else None
             if not isinstance(found, Found):
@@ -104,6 +128,13 @@ class Library:
             if source is None:
                 self._names.find(name)  # says where its file is not Modelica, if that is the reason
             raise
+
+    def _signals(self, name: str, source: str | None) -> list[Signal]:
+        """The inputs and outputs of a class of the roots."""
+        found = self._names.find(name) if source is None else None
+        if not isinstance(found, Found):
+            raise ModelError(f"'{name}': clock=… is for classes of the roots; a text of source=… has its own clock")
+        return list(signals_of(self._names, found))
 
     def _records(self, name: str, source: str | None) -> dict[str, bool]:
         """The overdetermined records of a class's connectors; true for those of conditional ones."""
@@ -118,6 +149,19 @@ class Library:
             and of.source.kind == "connector"
             for record in self._overdetermined(of)
         }
+
+    def _counted(self, name: str, source: str | None) -> frozenset[str]:
+        """The connectors of a class whose connections its equations count; assertions do not matter."""
+        found = self._names.find(name) if source is None else None
+        if not isinstance(found, Found):
+            return frozenset()
+        equations = [e for part in self._names.lineage(found) for e in part.source.equations]
+        return frozenset(
+            call.arguments[0].path
+            for call in tree.each_part(tuple(e for e in equations if not isinstance(e, tree.Effect)))
+            if isinstance(call, tree.Call) and call.function == "cardinality"
+            if isinstance(call.arguments[0], tree.Reference)
+        )
 
     def _overdetermined(self, connector: Found) -> Iterator[str]:
         """The records of a connector whose type has a function `equalityConstraint`: they are overdetermined."""
@@ -189,6 +233,7 @@ def component(
     *texts: str,
     roots: str | Path | Sequence[str | Path] = (),
     source: str | None = None,
+    clock: float | None = None,
     **modifications: Any,
 ) -> type[OpenComponent]:
     """A Modelica class as a class of components, with ports, signals and parameters.
@@ -215,6 +260,9 @@ def component(
     - `texts`: modifications as Modelica text, such as `"redeclare package Medium = Water"`.
     - `roots`: as those of `Library`.
     - `source`: Modelica text, such as a part of a system that is connected inside and has plain connectors outside.
+    - `clock` > 0: seconds between the ticks of the clock of a class whose surroundings decide it (chapter 16 of the
+        Modelica Language Specification). Inputs are sampled at the ticks, as they are before anything happens there,
+        and outputs are held in between.
     - `modifications`: values of parameters by name. They may decide the structure (conditional connectors, sizes,
         enumerations, given by the text of their name). Values of Real parameters may be given later, too.
 
@@ -225,7 +273,7 @@ def component(
     - `MissingPackage` if rumoca is needed and not installed.
     """
     return _library(tuple(map(str, [roots] if isinstance(roots, str | Path) else roots))).component(
-        name, *texts, source=source, **modifications
+        name, *texts, source=source, clock=clock, **modifications
     )
 
 

@@ -9,7 +9,9 @@ from .complete import completed
 from .external_objects import with_external_objects
 from .flat_model import FlatModel, flat_of
 from .front_end import FrontEnd
+from .kept_inputs import with_starts_of_inputs
 from .left_out import LEFT_OUT
+from .model_algorithms import with_algorithms
 from .read_base import read_base, read_modifiers
 from .read_rumoca import read_rumoca
 from .roots import ROOT
@@ -54,6 +56,7 @@ def _by_rumoca(text: str, file: Path | None, model: str | None, roots: Sequence[
     found = FrontEnd(roots).flatten(text, model, file)
     name = found.name.rpartition(".")[2]
     flat = with_external_objects(read_rumoca(found.dae, name), found.flat)
+    flat = with_starts_of_inputs(with_algorithms(flat, Sources(roots)))
     annotation = _annotation(text, name)
     return dataclasses.replace(flat, model=flat.model._replace(annotation=annotation))
 

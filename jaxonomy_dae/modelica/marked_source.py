@@ -1,13 +1,13 @@
-"""Where equations and connections stand in Modelica sources, and what their names are."""
+"""Where equations, connections and algorithms stand in Modelica sources, and what their names are."""
 
 import dataclasses
 import re
 from collections.abc import Callable, Iterator
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from ..base.errors import ModelError
 from . import tree
-from .read_base import Reader
+from .read_base import SECTION_ENDS, Reader
 from .sources import Constant, Found, Sources
 
 Change: TypeAlias = tuple[int, int, str]  # the places between which a text gets another one
@@ -31,14 +31,31 @@ class Mark:
     declared: tree.Declaration | None = None
 
 
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """A section of equations or of an algorithm, between two places of a text, from the word that begins it.
+
+    - `path`: the classes around it. `kind`: the words that begin it, such as `initial equation`.
+    - `number`: how many sections of this kind stand before it in its class.
+    """
+
+    path: tuple[str, ...]
+    kind: str
+    number: int
+    begin: int
+    end: int
+
+
 class Marked(Reader):
-    """A reader that notes where equations and values stand."""
+    """A reader that notes where equations, values and sections stand."""
 
     def __init__(self, text: str):
         super().__init__(text)
         self.path_of_class: list[str] = []
         self.local: list[str] = []
         self.marks: list[Mark] = []
+        self.sections: list[Section] = []
+        self._by_class: dict[tuple[str, ...], list[Mark]] = {}
 
     def _long(self, kind: str, name: str, continues: bool) -> tree.Class:
         self.path_of_class.append(name)
@@ -46,6 +63,17 @@ class Marked(Reader):
             return super()._long(kind, name, continues)
         finally:
             self.path_of_class.pop()
+
+    def statements(self, *ends: str) -> tuple[tree.Statement, ...]:
+        begin = self.i - 1
+        out = super().statements(*ends)
+        if ends == SECTION_ENDS:
+            initial = self.keys[begin - 1] == "initial"
+            kind, path = ("initial " if initial else "") + self.keys[begin], tuple(self.path_of_class)
+            number = sum(s.path == path and s.kind == kind for s in self.sections)
+            places = self.places[begin - initial], self.places[self.i - 1] + len(self.words[self.i - 1])
+            self.sections.append(Section(path, kind, number, *places))
+        return out
 
     def statement(self) -> tree.Statement:
         outer = list(self.local)
@@ -82,6 +110,13 @@ class Marked(Reader):
                 self.marks[k] = dataclasses.replace(self.marks[k], declared=d)
             yield d
 
+    def marks_of(self, path: tuple[str, ...]) -> list[Mark]:
+        """The marks of a class."""
+        if not self._by_class:
+            for m in self.marks:
+                self._by_class.setdefault(m.path, []).append(m)
+        return self._by_class.get(path, [])
+
     def _mark(self, begin: int, left: tree.Expression | None, right: tree.Expression, local: tuple[str, ...]) -> None:
         places = self.places[begin], self.places[self.i - 1] + len(self.words[self.i - 1])
         self.marks.append(Mark(tuple(self.path_of_class), *places, left, right, local))
@@ -89,6 +124,21 @@ class Marked(Reader):
 
 def changed_text(sources: Sources, text: str, change: Callable[[Found, Mark], Iterator[Change]]) -> str:
     """The text of a file of a library with what `change` says of each mark of its models. No line moves."""
+    return changed_classes(
+        sources, text, lambda of, marked: (c for m in marked.marks_of(of.marked) for c in change(of.found, m))
+    )
+
+
+class MarkedClass(NamedTuple):
+    """A model of a file, and the path to it within the file."""
+
+    found: Found
+    marked: tuple[str, ...]
+
+
+def changed_classes(sources: Sources, text: str, change: Callable[[MarkedClass, Marked], Iterator[Change]]) -> str:
+    """The text of a file of a library with what `change` says of each of its models that have equations, values or
+    sections. No line moves."""
     within = re.match(r"(?:\s|//[^\n]*\n)*within\s+([\w.]*)\s*;", text)
     prefix = [*within[1].split(".")] if within and within[1] else []
     try:
@@ -96,15 +146,11 @@ def changed_text(sources: Sources, text: str, change: Callable[[Found, Mark], It
         marked.file()
     except ModelError:  # what this reader does not read, rumoca may
         return text
-    found: dict[tuple[str, ...], Found | None] = {}
     changes: list[Change] = []
-    for mark in marked.marks:
-        if mark.path not in found:
-            member = sources.find(".".join([*prefix, *mark.path]))
-            found[mark.path] = member if isinstance(member, Found) else None
-        of = found[mark.path]
-        if of is not None and of.source.kind not in ("function", "record", "type", "operator"):
-            changes += change(of, mark)
+    for path in dict.fromkeys([*(m.path for m in marked.marks), *(s.path for s in marked.sections)]):
+        of = sources.find(".".join([*prefix, *path]))
+        if isinstance(of, Found) and of.source.kind not in ("function", "record", "type", "operator"):
+            changes += change(MarkedClass(of, path), marked)
     # From the end of the text, so that the places of changes before stay valid.
     for begin, end, new in sorted(changes, reverse=True):
         text = text[:begin] + new + "\n" * (text.count("\n", begin, end) - new.count("\n")) + text[end:]

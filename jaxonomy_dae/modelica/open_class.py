@@ -14,8 +14,12 @@ from . import tree
 from .boundaries import Closed, without_boundaries
 from .external_objects import with_external_objects
 from .flat_model import FlatModel
+from .held_outputs import with_held_outputs
+from .kept_inputs import with_starts_of_inputs
+from .model_algorithms import with_algorithms
 from .read_rumoca import read_open
 from .rumoca_expressions import Json
+from .sources import Sources
 
 AS_TEXT = (
     "a part of a model that has such connectors inside opens as a whole: write it as a Modelica text with plain "
@@ -67,8 +71,8 @@ class OpenClass:
     roots: tuple[str, ...] = ()
 
 
-def opened(name: str, closed: Closed) -> OpenClass:
-    """A class with open connectors, from its flattening.
+def opened(name: str, closed: Closed, sources: Sources) -> OpenClass:
+    """A class with open connectors, from its flattening and the libraries that it belongs to.
 
     **Raises:**
 
@@ -79,11 +83,14 @@ def opened(name: str, closed: Closed) -> OpenClass:
     if found.flat.get("is_partial"):
         raise ModelError(f"'{name}' is partial: open a class that extends it, or write one as source=…")
     ports = tuple(p for top in found.flat["top_level_connectors"] for p in _ports(name, top, found.flat["variables"]))
-    # A connector with streams was connected to a boundary, and has no equation that closes it.
-    flows = [f"{port.name}.{flow}" for port in ports for flow, _ in port.flows if not port.streams]
+    # A connector that was connected to a boundary has no equation that closes it.
+    loose = [p for p in ports if not {p.name, re.sub(r"\[[\d,]+\]$", "", p.name)} & closed.bounded]
+    flows = [f"{port.name}.{flow}" for port in loose for flow, _ in port.flows]
     flat = with_external_objects(read_open(found.dae, name.rpartition(".")[2], flows), found.flat)
-    flat = without_boundaries(flat, closed.outer)
+    flat = with_starts_of_inputs(with_algorithms(without_boundaries(flat, closed.outer), sources))
     storage = found.dae["storage"]
+    given = [v["name"] for v in storage["variables"] if v["attributes"]["causality"] == "output"]
+    flat = with_held_outputs(flat, [n for n in given if "." not in n])
     tunable, required, fixed = [], [], []
     roles: dict[str, list[str]] = {"input": [], "output": []}
     declared = {d.name: d for d in flat.model.declarations}

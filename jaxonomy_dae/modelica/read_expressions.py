@@ -204,8 +204,8 @@ class ExpressionReader:
                         rows.append([self.expression()])
                 self.need("]")
                 return tree.Matrix(tuple(map(tuple, rows)))
-            if self.take("-"):  # as in 2^-1
-                return tree.Unary("-", self.primary())
+            if self.take("-"):  # as in 2^-1, and a * -b^2, which is a * -(b^2)
+                return tree.Unary("-", self.operation(_POWER))
             self._fail("expected an expression")
         if kind == "word":
             if word in ("true", "false"):

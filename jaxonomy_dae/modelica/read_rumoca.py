@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 
 from ..base.errors import ModelError
 from . import tree
+from .clocked import with_clocked_equations
 from .flat_model import FlatModel
 from .rumoca_expressions import PREFIX, SCALAR, VARIABLE, Json, Places, RumocaExpressions
 
@@ -91,11 +92,11 @@ class _Reader:
 
     def model(self) -> FlatModel:
         s = self.of.storage
-        for each in (*s["previous_values"], *(c for c in s["clock_ownerships"] if c.get("sampled"))):
-            self.of.refuse("a synchronous clock", each.get("provenance"))
         equations = [e for op in self._continuous() for e in self._equations(op)]
-        equations += [e for activation, _, _, e in self._of_discrete() if activation == "always"]
-        equations += self._whens()
+        always = [e for activation, _, _, e in self._of_discrete() if activation == "always"]
+        clocked, others = with_clocked_equations(self.of, always)
+        equations += others
+        equations += [*clocked, *self._whens()]
         initial = [e for op in s["initialization_equation_operations"] for e in self._equations(op)]
         for each in (*s["initial_discrete_values"], *s["initial_parameter_values"]):
             line = self.of.line(each.get("provenance"))
@@ -130,6 +131,8 @@ class _Reader:
             for key in ("start", "nominal", "min", "max"):
                 if at.get(key) is not None and not (key == "start" and self._is_default(at[key], v)):
                     modifiers[key] = self._entry(at[key], place)
+            if of["scalar"] == "enumeration" and not constant:
+                modifiers.setdefault("start", tree.Number(1))  # its first literal
             value = self._entry(at["binding"], place) if at.get("binding") is not None else None
             is_bound = value is not None or "start" in modifiers or modifiers.get("fixed") == tree.Truth(False)
             if constant and not is_bound and self.flows is None:

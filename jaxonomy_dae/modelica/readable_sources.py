@@ -2,8 +2,11 @@
 
 rumoca 0.10.2 takes a parameter that is bound to a look-up in a table for an unknown with an equation, so that Clutch,
 Brake and OneWayClutch of the Modelica library have one equation too many. In the copy, an initial equation gives such a
-parameter its value. `complex_sources` says what it does not read of complex numbers. Folders without such files are
-links to the originals, and no line moves.
+parameter its value. It asks for the instants of `sample` before a run begins: a parameter that is the initial time is
+zero in the copy, where runs begin. It demands that parameters are constant that decide whether `Streams.error` is
+called, as those of LimPID. In the copy, this is an assertion. `complex_sources`, `boolean_connections`, `kept_inputs`
+and `model_algorithms` say what else it does not read. Folders without such files are links to the originals, and no
+line moves.
 """
 
 import contextlib
@@ -20,14 +23,29 @@ from ..host.kept import folder_of
 from .boolean_connections import with_single_connections
 from .complex_sources import with_real_equations
 from .kept_files import contents, write
+from .kept_inputs import with_kept_inputs
+from .model_algorithms import without_algorithms
 from .sources import Sources
 
-_FORMAT = 3  # to be raised with every change of what is changed in sources
+_FORMAT = 6  # to be raised with every change of what is changed in sources
 _LOOK_UP = "getTable1DValue"
 # parameter Type name(modifiers) = binding "comment";
 _BOUND = re.compile(
     r"\bparameter\s+(?P<type>[\w.]+)\s+(?P<name>\w+)\s*(?P<modifiers>\([^();]*\))?\s*="
     r"(?P<binding>[^;\"]*\bgetTable1DValue\w*\s*\([^;\"]*)(?P<comment>\"[^\"]*\"\s*)?;"
+)
+# parameter Type name(fixed = false) …; initial equation … name = time;
+_START = re.compile(
+    r"(?P<declared>\bparameter\s+[\w.]+\s+(?P<name>\w+)\s*)\(\s*fixed\s*=\s*false\s*\)"
+    r"(?P<between>(?:(?!\b(?:end|model|block|class)\s+\w+).)*?\binitial\s+equation\b"
+    r"(?:(?!\b(?:end|equation|algorithm)\b).)*?)\b(?P=name)\s*=\s*time\s*;",
+    re.S,
+)
+# if condition then Streams.error(message); end if;
+_ERROR = "Streams.error"
+_REFUSED = re.compile(
+    r"\bif\b(?P<condition>[^;\"]*?)\bthen\s+(?:\w+\.)*Streams\.error\s*\("
+    r"(?P<message>(?:[^;\"]|\"(?:[^\"\\]|\\.)*\")*)\)\s*;\s*end\s+if\s*;"
 )
 _EQUATIONS = re.compile(r"^[ \t]*equation\b", re.M)
 
@@ -66,6 +84,10 @@ def _changed(root: Path, sources: Sources) -> Iterator[tuple[str, str]]:
     for file in sorted(root.rglob("*.mo")):
         text = file.read_text(encoding="utf-8-sig", errors="replace")
         new = _by_initial_equations(text) if _LOOK_UP in text else text
+        new = _by_assertions(new) if _ERROR in new else new
+        new = _START.sub(r"\g<declared> = 0\g<between>", new)
+        new = without_algorithms(sources, new)
+        new = with_kept_inputs(sources, new)
         new = with_real_equations(sources, new)
         new = with_single_connections(sources, new)
         if new != text:
@@ -88,6 +110,19 @@ def _by_initial_equations(text: str) -> str:
             out += f"initial equation {' '.join(equations)} equation" if equations else found[0]
             equations = []
     return out + text[done:]
+
+
+def _by_assertions(text: str) -> str:
+    """The text with assertions in place of conditions that do nothing but end a run with an error."""
+
+    def assertion(found: re.Match[str]) -> str:
+        condition = found["condition"].strip()
+        if re.search(r"\b(if|then|elseif|else)\b", condition):
+            return found[0]
+        new = f"assert(not ({condition}), {found['message']});"
+        return new + "\n" * (found[0].count("\n") - new.count("\n"))
+
+    return _REFUSED.sub(assertion, text)
 
 
 def _mirror(root: Path, copy: Path, inside: Path, changed: dict[Path, str]) -> None:

@@ -74,7 +74,7 @@ class RumocaExpressions:
         of = self.storage["domains"][domain]
         outer = [] if of.get("parent") is None else self.binders(of["parent"])
         own = enumerate(of["domain"]["binders"])
-        return outer + [((domain, k), range(b["lower"], b["upper"] + 1, b["step"])) for k, b in own]
+        return outer + [((domain, k), _values(b)) for k, b in own]
 
     def condition(self, number: int) -> tree.Expression:
         entry = self.storage["conditions"][number]
@@ -91,7 +91,7 @@ class RumocaExpressions:
         if kind == "discrete":
             return self.expression(inside, {})
         if kind == "clock":
-            return self._clock(inside)
+            return self.clock(inside)
         if kind == "not":
             return tree.Unary("not", self.condition(inside))
         if kind in ("and", "or"):
@@ -101,13 +101,18 @@ class RumocaExpressions:
             return tree.Array(tuple(p for e in parts for p in (e.entries if isinstance(e, tree.Array) else (e,))))
         self.refuse(f"a condition of the kind '{kind}'", entry.get("provenance"))
 
-    def _clock(self, number: int) -> tree.Expression:
+    def clock(self, number: int) -> tree.Call:
+        """The condition that a clock ticks."""
         clock = self.storage["clocks"][number]
         lattice = clock["kind"].get("periodic", {}).get("lattice")
         if lattice is None:
             self.refuse(f"a clock of the kind '{next(iter(clock['kind']))}'", clock.get("provenance"))
         phase, period = (tree.Number(lattice[k]["num"] / lattice[k]["den"]) for k in ("phase", "period"))
         return tree.Call("sample", (phase, period), ())
+
+    def interval(self, number: int) -> tree.Expression:
+        """The seconds between two ticks of a clock."""
+        return self.clock(number).arguments[1]
 
     # --- expressions -------------------------------------------------------------------------------------------------
 
@@ -137,7 +142,13 @@ class RumocaExpressions:
         if kind == "index":
             return self._indexed(inside, first, places)
         if kind == "comprehension":
-            own = [(key, values) for key, values in self.binders(inside["domain"]) if key not in places]
+            # The domain around it is that of a loop, or of the array that the whole equation is about.
+            own = [(key, values) for key, values in self.binders(inside["domain"]) if key[0] == inside["domain"]]
+            names = [b["display_name"] for b in self.storage["domains"][inside["domain"]]["domain"]["binders"]]
+            # rumoca lets the first iterator count the rows: the last one does (section 10.4.1.1). What it writes itself
+            # for arrays has their order.
+            if not all(name.startswith(("__", "vectorized_call_")) for name in names):
+                own.reverse()
             return self._comprehended(own, inside["body"], places)
         if kind == "field":
             field = self.types[self._record_type(inside["base"])]["record_fields"][inside["field"]]["name"]
@@ -154,6 +165,8 @@ class RumocaExpressions:
             return tree.Range(first, tree.Number(1) if step is None else self.expression(step, places), last)
         if kind == "array_update":
             return self._updated(number)
+        if kind == "clock_transfer":
+            return self._transferred(inside, where, places)
         if kind == "runtime_quotient_owner":
             sides = (self.expression(inside["lhs"], places), self.expression(inside["rhs"], places))
             return tree.Call(inside["builtin"], sides, ())
@@ -173,6 +186,15 @@ class RumocaExpressions:
         builtin: str = inside["builtin"]
         return tree.Call(_BUILTIN.get(builtin, builtin), arguments, ())
 
+    def _transferred(self, inside: Json, where: Json, places: Places) -> tree.Expression:
+        """A value at the ticks of another clock: the last one that it had at its own."""
+        kind, count = next(iter(inside["kind"].items()))
+        if kind == "shift_sample" and not count["counter"] < count["resolution"]:
+            self.refuse("a shift by a whole interval of a clock or more", where)
+        if kind not in ("sub_sample", "super_sample", "shift_sample"):
+            self.refuse(f"the conversion '{kind}' of a clock", where)
+        return self.expression(inside["source"], places)
+
     def _arguments(self, inside: Json, first: int, places: Places) -> tuple[tree.Expression, ...]:
         return tuple(self.expression(k, places) for k in self.operands[first : first + inside["operand_count"]])
 
@@ -190,6 +212,11 @@ class RumocaExpressions:
             return tree.Call("der", (self.variable(inside, subscripts),), ())
         if kind.startswith("pre_") and kind[4:] in VARIABLE:
             return tree.Call("pre", (self.variable(inside, subscripts),), ())
+        if kind == "previous":
+            of = self.storage["previous_values"][inside]["variable"]
+            return tree.Call("pre", (self.variable(of, subscripts),), ())
+        if kind == "clock_interval":
+            return self.interval(inside)
         if kind == "condition":
             return self.condition(inside)
         if kind == "terminal":
@@ -201,8 +228,19 @@ class RumocaExpressions:
             name = self.functions[inside["function"]]["parameters"][inside["ordinal"]]["name"]
             return tree.Reference((name,), (subscripts,))
         if kind == "delay":
-            return tree.Call("delay", (), ())
+            return self._delay(self.storage["delays"][inside], places, where)
         self.refuse(f"'{kind}'", where)
+
+    def _delay(self, delay: Json, places: Places, where: Json) -> tree.Expression:
+        """delay(e, T), or delay(e, T, Tmax)."""
+        kind, given = next(iter(delay["kind"].items()))
+        if kind not in ("parameter_delay", "bounded_delay"):
+            self.refuse(f"a delay of the kind '{kind}'", where)
+        # What must be constant is an expression and its value, the delay of a bounded one an expression alone.
+        parts = [given[name] for name in ("delay_time", "delay_max") if name in given]
+        numbers = [part["expression"] if isinstance(part, Mapping) else part for part in parts]
+        arguments = tuple(self.expression(n, places) for n in (delay["source"], *numbers))
+        return tree.Call("delay", arguments, ())
 
     def _indexed(self, inside: Json, first: int, places: Places) -> tree.Expression:
         subscripts: list[tree.Expression] = []
@@ -297,7 +335,7 @@ class RumocaExpressions:
                 yield tree.Assignment(tree.Reference((names[a["target"]],)), tree.Reference((f":{k}",)), line)
         elif kind == "for":
             ranges = [
-                (_binder(*key), tree.Range(tree.Number(r.start), tree.Number(r.step), tree.Number(r.stop - 1)))
+                (_binder(*key), tree.Range(*map(tree.Number, (r.start, r.step, r[-1] if r else r.start - r.step))))
                 for key, r in self.binders(inside["domain"])
                 if key[0] == inside["domain"]
             ]
@@ -368,6 +406,12 @@ def _change(e: tree.Binary) -> tree.Expression:
         if e.operator == "and" and other is not e.right:
             return tree.Call("edge", other.arguments, ())
     return e
+
+
+def _values(binder: Json) -> range:
+    """The values of a binder, the last one included; its step may be negative."""
+    step = binder["step"]
+    return range(binder["lower"], binder["upper"] + (1 if step > 0 else -1), step)
 
 
 def _binder(domain: int, ordinal: int) -> str:

@@ -15,21 +15,25 @@ import sympy
 
 from ..base.errors import ModelError
 from ..graph.expressions.from_sympy import symbols_of
-from ..write.choices import exchanged
 from ..write.component import Component
 from ..write.discrete_equations import BEFORE, STARTED, DiscreteEquations
-from ..write.events import terminate
+from ..write.events import Sampled, terminate
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol, der
-from .definitions import assigned_in, find_definitions
+from .builtin import filled
+from .clocked import SAMPLED
+from .definitions import assigned_in, find_definitions, remembered
+from .evaluate import array_of
 from .flat_model import FlatModel
 from .interpret import Interpreter
-from .left_out import LEFT_OUT
+from .iterations import is_of_parameters, previous, variables_in
+from .kept_inputs import KEPT
+from .left_out import LEFT_OUT, TIME_TABLE, time_table_coefficients
 from .random_numbers import RandomNumbers
 from .roots import ROOT, root
 from .tables import CONSTANT, EXTERNALS, GET_VALUE, LINEAR, SMOOTHNESS, Table
-from .tree import Assignment, Call, Class, Declaration, Equality, Expression, Reference, Truth, each_part, entry_name
+from .tree import Assignment, Call, Class, Declaration, Equality, Expression, Reference, Statement, each_part
 from .values import Record, Value, as_number, both, is_condition, negated, plain
-from .written_out import entries_of, unrolled
+from .written_out import entries_of, fields_of, unrolled
 
 REAL = "Real"
 _TEXTS = ("String", "StateSelect", "AssertionLevel")
@@ -47,9 +51,10 @@ class Scope:
     - `definitions`: which statement determines which variable.
     - `discrete`: the discrete equations; `kept`: relations whose truth is kept between events.
     - `names`: names of long expressions of functions.
-    - `carried_out`: what algorithms assign, by their numbers.
+    - `carried_out`: what algorithms assign, by their numbers; `assigned_first`: what initial algorithms assign.
     - `said`: the discrete variables of which initial equations say what they are. `waiting`: initial equations of
       discrete variables that wait for others, which they do while `postpones` is true.
+    - `clock`: the clock of the body of a `when` that is being read, if nothing else lets it act.
     - `as_numbers`: True while parameters are read as their values, which are final then.
     """
 
@@ -65,9 +70,10 @@ class Scope:
         self.being: list[str] = []
         special: dict[str, Callable[..., Value]] = {
             "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self._is_initial,
-            "terminal": lambda: False, "sample": self._sample, "delay": _delay,
+            "terminal": lambda: False, "sample": self._sample, SAMPLED: self._sampled, "delay": self._delay,
         }  # fmt: skip
         special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
+        special[TIME_TABLE] = self._time_table
         special |= {name: functools.partial(_clocked, name) for name in _CLOCKED if name not in flat.classes}
         self.random = RandomNumbers(component)
         self.interpreter = Interpreter(
@@ -76,9 +82,11 @@ class Scope:
             | {name: functools.partial(self._read_table, EXTERNALS[name]) for name in GET_VALUE},
             self.entries, self._named, self._opaque,
         )  # fmt: skip
+        self.interpreter.is_integer = self._is_integer
         self.discrete = DiscreteEquations(component, self.interpreter.quieted)
         self.kept = self.discrete.kept
         self.as_numbers = False
+        self.clock: Sampled | None = None
         self.final: dict[str, Value] = {}
         # Only now: sizes may depend on parameters, records and functions, which the interpreter finds by their names.
         self.flat = flat = dataclasses.replace(flat, model=self._written_out(flat.model))
@@ -88,8 +96,10 @@ class Scope:
         self.fields.update(fields)
         self.definitions = find_definitions(self.flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
+        self.delays: dict[tuple[Value, Value, Value], sympy.Symbol] = {}
         self.ends: set[sympy.Basic] = set()  # conditions that end the run
         self.carried_out: dict[int, dict[str, Value]] = {}
+        self.assigned_first: dict[tuple[Statement, ...], dict[str, Value]] = {}
         self.said: set[DiscreteSymbol] = set()
         self.waiting: list[tuple[Value, Value]] = []
         self.postpones = True
@@ -108,14 +118,29 @@ class Scope:
             return isinstance(self.evaluate(e), list)
 
         declared: list[Declaration] = []
-        for d in model.declarations:
-            if d.dimensions and not d.prefixes & _CONSTANT and self.kind(d.type) not in _TEXTS:
-                sizes = [self.interpreter.constant(n) for n in d.dimensions]
-                declared += located(model.name, d.line, lambda d, n: list(entries_of(d, n, is_array)), d, sizes)
+        waiting = list(reversed(model.declarations))
+        while waiting:
+            d = waiting.pop()
+            record = self._record_of(d)
+            if record is not None and not d.dimensions:
+                waiting += reversed(list(fields_of(d, record)))
+            elif d.dimensions and (record or not d.prefixes & _CONSTANT and self.kind(d.type) not in _TEXTS):
+                sizes = [self.interpreter.count(n) for n in d.dimensions]
+                entries = located(model.name, d.line, lambda d, n: list(entries_of(d, n, is_array)), d, sizes)
+                if record is None:
+                    declared += entries
+                else:
+                    waiting += reversed(entries)
             else:
                 declared.append(d)
         equations, initial = (unrolled(s, values_of) for s in (model.equations, model.initial_equations))
         return model._replace(declarations=tuple(declared), equations=equations, initial_equations=initial)
+
+    def _record_of(self, d: Declaration) -> Class | None:
+        """The record of which a variable is one; a constant that has a value stays whole."""
+        of = self.flat.classes.get(d.type)
+        whole = d.value is not None and d.prefixes & _CONSTANT
+        return None if of is None or of.kind != "record" or whole else of
 
     def evaluate(self, e: Expression) -> Value:
         return self.interpreter.evaluate(e)
@@ -135,6 +160,10 @@ class Scope:
         if c.literals:
             return "Integer"
         return self.kind(c.made_of) if c.made_of is not None else name
+
+    def _is_integer(self, symbol: str) -> bool:
+        d = self.declared.get(symbol.removeprefix(BEFORE).removesuffix(")") if symbol.startswith(BEFORE) else symbol)
+        return d is not None and self.kind(d.type) == "Integer"
 
     def value(self, name: str) -> Value:
         known = self.final if self.as_numbers else self.known
@@ -164,21 +193,10 @@ class Scope:
     def _gathered(self, name: str) -> Value:
         """An array or a record whose entries are declared one by one."""
         if name in self.entries:
-            return self._array_of(name, self.entries[name], 0)
+            return array_of(name, self.entries[name], self.value)
         if name in self.fields:
             return Record({f: self.value(f"{name}.{f}") for f in self.fields[name]})
         raise KeyError(name)
-
-    def _array_of(self, name: str, places: list[tuple[int, ...]], depth: int) -> Value:
-        """The array of the entries at these places, which have equal numbers before `depth`."""
-        out = []
-        for k in sorted({p[depth] for p in places}):
-            inside = [p for p in places if p[depth] == k]
-            if len(inside[0]) > depth + 1:
-                out.append(self._array_of(name, inside, depth + 1))
-            else:
-                out.append(self.value(entry_name(name, inside[0])))
-        return out
 
     def _constant(self, d: Declaration) -> Value:
         """The value of a parameter: a symbol for a Real, which is then a parameter of the component."""
@@ -191,7 +209,7 @@ class Scope:
         if self._is_unknown(d):
             return self._unknown_parameter(d)
         if d.value is None and self.kind(d.type) != REAL:
-            value = self._said_initially(d.name) if d.modifiers.get("fixed") == Truth(False) else None
+            value = self._said_initially(d.name) if self._fixed(d) is False else None
             if value is not None:
                 return value
             if "start" in d.modifiers:
@@ -199,7 +217,11 @@ class Scope:
         if d.value is None:
             if self.kind(d.type) == REAL and not d.dimensions:
                 start = d.modifiers.get("start")
-                return 0.0 if start is None else self._as_parameter(d, self.evaluate(start))
+                return float(self._fall_back(d)) if start is None else self._as_parameter(d, self.evaluate(start))
+            if "start" in d.modifiers:  # of an array
+                start = self.evaluate(d.modifiers["start"])
+                sizes = [self.interpreter.count(n) for n in d.dimensions]
+                return start if isinstance(start, list) else filled(start, *sizes)
             raise ModelError(f"the parameter '{d.name}' has no value")
         return self._as_parameter(d, self.evaluate(d.value))
 
@@ -208,9 +230,9 @@ class Scope:
         for statements in self.flat.model.initial_algorithms:
             if name not in assigned_in(statements):
                 continue
-            local = self.interpreter.assigned_by(statements)
-            self.known.update(local)
-            return local.get(name)
+            if statements not in self.assigned_first:
+                self.assigned_first[statements] = self.interpreter.assigned_by(statements)
+            return self.assigned_first[statements].get(name)
         return None
 
     def _as_parameter(self, d: Declaration, value: Value) -> Value:
@@ -222,7 +244,7 @@ class Scope:
                 return value
         elif not isinstance(value, sympy.Expr):
             return value
-        elif not _is_of_parameters(value):
+        elif not is_of_parameters(value):
             return value
         return self.component.parameter(d.name, value, unit=self._unit(d))
 
@@ -257,9 +279,14 @@ class Scope:
         """What an algorithm assigns."""
         if number not in self.carried_out:
             assigned, kept = self.definitions.assigned[number], self.definitions.stored
-            stored = {n: previous(self.stored(n)) for n in assigned if n in kept}
             statements = self.definitions.algorithms[number]
-            self.carried_out[number] = self.interpreter.assigned_by(statements, stored)
+            # What an algorithm does not assign in every case begins with what it was before, or with its start if it is
+            # not discrete (section 11.1.2).
+            first = {n: previous(self.stored(n)) for n in assigned if n in kept}
+            for n in sorted(remembered(statements, self.flat.model) - first.keys()):
+                start = self._start(self.declared[n].modifiers.get("start"))
+                first[n] = float(self._fall_back(self.declared[n])) if start is None else start
+            self.carried_out[number] = self.interpreter.assigned_by(statements, first)
         return self.carried_out[number]
 
     # --- declarations ------------------------------------------------------------------------------------------------
@@ -276,13 +303,21 @@ class Scope:
                 self.value(d.name)
 
     def _is_unknown(self, d: Declaration) -> bool:
-        return d.modifiers.get("fixed") == Truth(False) and self.kind(d.type) == REAL
+        return self._fixed(d) is False and self.kind(d.type) == REAL
+
+    def _fixed(self, d: Declaration) -> bool | None:
+        """The attribute `fixed`; None where nothing gives it."""
+        e = d.modifiers.get("fixed")
+        value = None if e is None else self.interpreter.constant(e)
+        if value is not None and not isinstance(value, bool):
+            raise ModelError(f"line {d.line}: 'fixed' of '{d.name}' is true or false; got {value!r}")
+        return value
 
     def _unknown_parameter(self, d: Declaration) -> Value:
         """A parameter that initial equations determine: a variable that does not change. If one of them just says
         what it is, it is a parameter."""
         value = self._said_initially(d.name)
-        if isinstance(value, int | float) or isinstance(value, sympy.Expr) and _is_of_parameters(value):
+        if isinstance(value, int | float) or isinstance(value, sympy.Expr) and is_of_parameters(value):
             return self._as_parameter(d, value)
         start = d.modifiers.get("start") if d.value is None else d.value
         symbol = self.component.variable(d.name, start=self._start(start), unit=self._unit(d))
@@ -306,15 +341,24 @@ class Scope:
 
     def _declare_stored(self, d: Declaration) -> Value:
         start = self._start(d.modifiers.get("start"))
-        start = self._least(d.type) if start is None else as_number(start)
+        start = self._fall_back(d) if start is None else as_number(start)
         self.component.discrete(d.name, start=start)
         self.discrete.before(d.name)
         if self.kind(d.type) == REAL:
             self.discrete.reals.add(d.name)
         return self.stored(d.name)
 
+    def _fall_back(self, d: Declaration) -> float | int:
+        """What a variable starts at if nothing says so: what is next to zero within its bounds (section 4.9)."""
+        value: float | int = self._least(d.type)
+        for bound, further in (("min", max), ("max", min)):
+            e = d.modifiers.get(bound)
+            limit = None if e is None else self.evaluate(e)
+            value = further(value, limit) if isinstance(limit, int | float) else value
+        return value
+
     def _least(self, type_name: str) -> int:
-        """What a discrete variable starts at if nothing says so: an enumeration at its first literal, others at 0."""
+        """The number next to zero of a type: an enumeration has its first literal, others have 0."""
         c = self.flat.classes.get(type_name)
         if c is not None and c.made_of is not None:
             return self._least(c.made_of)
@@ -334,10 +378,14 @@ class Scope:
         start = self._start(d.modifiers.get("start"))
         # An input of a part is bound to what drives it, and is an ordinary variable.
         if "input" in d.prefixes and d.value is None:
-            return self.component.input(d.name, default=None if start is None else float(start), unit=self._unit(d))
-        fixed = d.modifiers.get("fixed") == Truth(True)
+            # One in parameters would not follow them.
+            default = None if isinstance(start, sympy.Expr) and start.free_symbols else start
+            return self.component.input(
+                d.name, default=None if default is None else float(default), unit=self._unit(d)
+            )  # fmt: skip
+        fixed = self._fixed(d) is True
         if fixed and start is None:
-            start = 0.0
+            start = float(self._fall_back(d))
         if d.value is not None:
             self.definitions.equations.append(Equality(Reference((d.name,)), d.value, d.line))
         return self.component.variable(
@@ -362,7 +410,7 @@ class Scope:
         if e in self.names:
             return self.names[e]
         name = f":value[{len(self.names)}]"
-        if _is_of_parameters(e):
+        if is_of_parameters(e):
             self.names[e] = self.component.parameter(name, e)
         else:
             self.names[e] = self.component.variable(name)
@@ -393,6 +441,15 @@ class Scope:
         finally:
             self.as_numbers = False
 
+    def _time_table(self, table: Expression, *others: Expression) -> Value:
+        """The line of a time table at an event; the entries of the table, which say when events are, are numbers."""
+        self.as_numbers = True
+        try:
+            entries = self.evaluate(table)
+        finally:
+            self.as_numbers = False
+        return time_table_coefficients(entries, *map(self.evaluate, others))
+
     def _read_table(self, read: Callable[..., Value], table: Table, column: int, u: Value, *more: Value) -> Value:
         """The value of a table. One without extrapolation ends the run where it is read outside of its rows."""
         outside = table.outside(u) if isinstance(u, sympy.Expr) else False
@@ -407,50 +464,89 @@ class Scope:
         return read(table, column, u, *more)
 
     def _pre(self, e: Expression) -> Value:
-        value = self.evaluate(e)
-        for s in _variables(value):
+        value = self._now(e)
+        if self.clock is not None and variables_in(value):
+            return self._before_ticks(self.clock, value)
+        for s in variables_in(value):
             # A state jumps by `reinit` alone, at the end of an iteration: until then it is what it was before.
             if not s.path.startswith(":") and s.path not in self.states:
+                name = s.path.replace(KEPT, "")
                 raise ModelError(
-                    f"pre({s.path}): '{s.path}' is neither discrete nor a state, and may jump with others at the "
-                    f"instant: what it was before is not kept. Write pre(…) of what its equation reads"
+                    f"pre({name}): '{name}' is neither discrete nor a state, and may jump with others at the instant: "
+                    "what it was before is not kept. Write pre(…) of what its equation reads"
                 )
-        return previous(value)
+        return self._previous(e)
+
+    def _previous(self, e: Expression) -> Value:
+        """A variable in the iteration before. Its subscripts choose it as they are now."""
+        if not isinstance(e, Reference):
+            return previous(self.evaluate(e))
+        return self.interpreter.referred(e, lambda name: previous(self.value(name)), self.interpreter.around)
+
+    def _now(self, e: Expression) -> Value:
+        if not isinstance(e, Reference):
+            return self.evaluate(e)
+        return self.interpreter.referred(e, self.value, self.interpreter.around)
 
     @functools.cached_property
     def states(self) -> set[str]:
         """The variables of which equations read the derivative."""
         parts = each_part((self.flat.model.equations, self.flat.model.algorithms))
         calls = (p for p in parts if isinstance(p, Call) and p.function == "der")
-        return {s.path for c in calls for s in _variables(self.evaluate(c.arguments[0]))}
+        return {s.path for c in calls for s in variables_in(self.evaluate(c.arguments[0]))}
 
     def _edge(self, e: Expression) -> Value:
-        now = self.evaluate(e)
-        return both(now, negated(previous(now)))
+        now = self._now(e)
+        return both(now, negated(self._previous(e)))
 
     def _change(self, e: Expression) -> Value:
-        now = self.evaluate(e)
-        return negated(plain(sympy.Eq(as_number(now), as_number(previous(now)))))
+        now = self._now(e)
+        return negated(plain(sympy.Eq(as_number(now), as_number(self._previous(e)))))
 
     def _is_initial(self) -> Value:
         return negated(self.discrete.phase(STARTED))
 
     def _sample(self, start: Expression, interval: Expression) -> Value:
-        return self.discrete.tick(self.component.sampled(self.evaluate(interval), self.evaluate(start)))
+        return self.discrete.tick(
+            self.component.sampled(*(self.interpreter.evaluate(e, self.interpreter.around) for e in (interval, start)))
+        )
 
+    def _sampled(self, e: Expression, start: Expression, interval: Expression) -> Value:
+        """A value before the ticks of a clock."""
+        clock = self.component.sampled(self.evaluate(interval), self.evaluate(start))
+        value = self.evaluate(e)
+        return self._before_ticks(clock, value)
 
-def _is_of_parameters(value: sympy.Expr) -> bool:
-    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols_of(value))
+    def _before_ticks(self, clock: Sampled, value: Value) -> Value:
+        if isinstance(value, list):
+            return [self._before_ticks(clock, v) for v in value]
+        found = self.discrete.at_ticks(clock, sympy.sympify(as_number(value)))
+        return sympy.Eq(found, 1) if is_condition(value) else found
 
+    def _delay(self, e: Expression, time: Expression, longest: Expression | None = None) -> Value:
+        by = self.evaluate(time)
+        # With a delay that is constant, the specification asks for no limit, and one that is given says nothing more.
+        changes = isinstance(by, sympy.Expr) and not is_of_parameters(by)
+        if changes and longest is None:
+            raise ModelError(f"delay(…) with the delay {by}, which changes, needs a third argument, the longest delay")
+        limit = self.evaluate(longest) if changes and longest is not None else None
+        return self._delayed(self.evaluate(e), by, limit)
 
-def _variables(value: Value) -> list[VariableSymbol]:
-    """The continuous variables in a value."""
-    if isinstance(value, list):
-        return [s for v in value for s in _variables(v)]
-    if isinstance(value, Record):
-        return [s for v in value.values() for s in _variables(v)]
-    found = symbols_of(value) if isinstance(value, sympy.Basic) else ()
-    return [s for s in found if isinstance(s, VariableSymbol)]
+    def _delayed(self, value: Value, time: Value, longest: Value) -> Value:
+        """A value, or each entry of an array, delayed."""
+        if isinstance(value, list):
+            return [self._delayed(v, time, longest) for v in value]
+        value = as_number(value)
+        if isinstance(time, int | float) and time == 0:
+            return value
+        if not isinstance(value, sympy.Expr) or (is_of_parameters(value) and not value.has(TimeSymbol)):
+            return value
+        key = value, time, longest
+        if key not in self.delays:
+            name, within = f":delayed[{len(self.delays)}]", self.kept.in_equations
+            by = within(time) if isinstance(time, sympy.Basic) else time
+            self.delays[key] = self.component.delayed(name, within(value), by, longest)
+        return self.delays[key]
 
 
 T = TypeVar("T")
@@ -464,10 +560,6 @@ def located(model: str, line: int, do: Callable[..., T], *arguments: object) -> 
         raise ModelError(f"{model}, line {line}: {error}") from None
     except (TypeError, ValueError, AttributeError, IndexError, RecursionError) as error:
         raise ModelError(f"{model}, line {line}: {type(error).__name__}: {error}") from error
-
-
-def _delay(*_: Expression) -> Value:
-    raise ModelError("delay(…) needs the past of a variable, which is not kept")
 
 
 def _clocked(name: str, *_: Expression) -> Value:
@@ -489,25 +581,3 @@ def _gather(names: Iterable[str]) -> tuple[dict[str, list[tuple[int, ...]]], dic
             rest = name[dot.end() :]
             fields.setdefault(name[: dot.start()], {})[re.split(r"[.\[]", rest)[0]] = None
     return {k: list(v) for k, v in entries.items()}, {k: list(v) for k, v in fields.items()}
-
-
-def previous(value: Value) -> Value:
-    """A value, or a discrete variable, in the iteration before."""
-    if isinstance(value, list):
-        return [previous(v) for v in value]
-    if isinstance(value, Record):
-        return Record({k: previous(v) for k, v in value.items()})
-    if not isinstance(value, sympy.Basic):
-        return value
-    found = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
-    return exchanged(value, {s: DiscreteSymbol(f"{BEFORE}{n})") for s, n in found.items() if not n.startswith(":")})
-
-
-def present(value: Value) -> Value:
-    """A value with what it reads of the iteration before as it is now: at the initial time they are the same."""
-    if not isinstance(value, sympy.Basic):
-        return value
-    names = {s: s.path for s in symbols_of(value) if isinstance(s, DiscreteSymbol)}
-    return exchanged(
-        value, {s: DiscreteSymbol(n.removeprefix(BEFORE)[:-1]) for s, n in names.items() if n.startswith(BEFORE)}
-    )

@@ -18,13 +18,14 @@ class Found:
 
     - `path`: its full name, by the package through which it was inherited.
     - `scopes`: where names that it uses are looked up after itself, innermost first.
-    - `changes`: the modifiers of the short definition through which it was reached.
+    - `changes`, `prefixes`: the modifiers and prefixes of the short definitions through which it was reached.
     """
 
     source: Class
     path: str
     scopes: tuple["Found", ...]
     changes: tuple[tuple[Modifiers, tuple["Found", ...]], ...] = ()
+    prefixes: frozenset[str] = frozenset()
 
     @property
     def inside(self) -> tuple["Found", ...]:
@@ -169,11 +170,12 @@ class Sources:
         target = self.class_of(alias.type, found.scopes)
         if target is None:
             return found
-        return dataclasses.replace(target, changes=((alias.modifiers, found.scopes), *target.changes))
+        changes = ((alias.modifiers, found.scopes), *target.changes)
+        return dataclasses.replace(target, changes=changes, prefixes=target.prefixes | alias.prefixes)
 
     def _inherited(self, of: Found, name: str) -> Member | None:
         for base, modifiers in of.source.bases:
-            target = self.class_of(base, of.scopes)
+            target = self.base_of(of, base)
             found = self._changed(of, target, name, [(modifiers, of.inside)]) if target else None
             if found is not None:
                 return found
@@ -232,16 +234,24 @@ class Sources:
             inherited = self.inherited_class(found)
             out += self.lineage(inherited) if inherited else []
         for base, _ in found.source.bases:
-            target = self.class_of(base, found.scopes)
+            target = self.base_of(found, base)
             out += self.lineage(target) if target else []
         return [*out, found]
+
+    def base_of(self, of: Found, name: str) -> Found | None:
+        """A base of a class, whose name is looked up among its imports and around it, not in what it inherits."""
+        first, *rest = name.split(".")
+        if any(local == first for local, _ in of.source.imports):
+            found = self._inner(self._imported(of, first), rest)
+            return found if isinstance(found, Found) else None
+        return self.class_of(name, of.scopes)
 
     def inherited_class(self, found: Found) -> Found | None:
         """What `redeclare function extends f` continues: f as the bases of its package have it."""
         name, reached = found.source.name, found.scopes[0]
         holder = next((s for s in found.scopes if s.source.classes.get(name) is found.source), reached)
         for base, _ in holder.source.bases:
-            target = self.class_of(base, holder.scopes)
+            target = self.base_of(holder, base)
             inner = self._within(reached, target, name) if target else None
             if isinstance(inner, Found):
                 return inner

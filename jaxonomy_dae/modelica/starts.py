@@ -12,7 +12,8 @@ from ..graph.expressions.smooth import Smooth
 from ..write.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
 from .continuous import equal, pairs, side_by_side
 from .definitions import assigned_in, with_entries
-from .scope import Scope, present
+from .iterations import present
+from .scope import Scope
 from .tree import Branches, Call, Equality, Reference, Statement, each_part
 from .values import Value, as_number, is_condition
 

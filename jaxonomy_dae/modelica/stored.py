@@ -10,7 +10,7 @@ from . import tree
 from .flat_model import FlatModel
 from .open_class import OpenClass, OpenPort
 
-FORMAT = 4  # to be raised with every change of what stands in these records
+FORMAT = 6  # to be raised with every change of what stands in these records
 _TREE = (
     tree.Number, tree.Truth, tree.Text, tree.Reference, tree.Whole, tree.End, tree.Call, tree.Unary, tree.Binary,
     tree.Choice, tree.Array, tree.Matrix, tree.Several, tree.Range, tree.Comprehension, tree.Part, tree.Equality,

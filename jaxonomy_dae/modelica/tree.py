@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
+BUILT_IN = ("Real", "Integer", "Boolean", "String")
+
 
 class Number(NamedTuple):
     """A literal: `value` is a float, or an int where the text has neither point nor exponent."""
@@ -122,9 +124,16 @@ class Part(NamedTuple):
     subscripts: tuple["Expression", ...]
 
 
+class Result(NamedTuple):
+    """The result of a function with this number, counted from 0."""
+
+    call: "Expression"
+    number: int
+
+
 Expression: TypeAlias = (
     Number | Truth | Text | Reference | Whole | End | Call | Unary | Binary | Choice | Array | Matrix
-    | Several | Range | Comprehension | Part
+    | Several | Range | Comprehension | Part | Result
 )  # fmt: skip
 
 

@@ -9,8 +9,10 @@ import sympy
 from ..base.errors import ModelError
 from ..write.symbols import DiscreteSymbol, VariableSymbol
 from . import tree
+from .continuous import pairs
 from .definitions import assigned_in, with_entries
-from .scope import Scope, previous
+from .iterations import previous
+from .scope import Scope
 from .values import Value, as_condition, as_number, both, chosen, negated
 
 Target: TypeAlias = sympy.Symbol | str  # what an action writes; a text for `terminate`
@@ -24,14 +26,18 @@ def read_followed(scope: Scope, name: str) -> None:
 
 def read_when(scope: Scope, s: tree.Branches) -> None:
     """A `when` among equations: what its body assigns is what it was before where no branch acts."""
-    acting = scope.discrete.branches([list(_conditions(scope, c, scope.value)) for c, _ in s.branches])
+    conditions = [list(_conditions(scope, c, scope.value)) for c, _ in s.branches]
+    acting = scope.discrete.branches(conditions)
     cases: dict[str, list[tuple[Value, Value]]] = {}
-    for acts, (_, body) in zip(acting, s.branches, strict=True):
+    for acts, when, (_, body) in zip(acting, conditions, s.branches, strict=True):
+        # What a variable was before a tick is known, as nothing has happened at the instant.
+        scope.clock = scope.discrete.clock_of([truth for truth, _ in when])
         for target, value in _each_action(scope, body):
             if isinstance(target, DiscreteSymbol):
                 cases.setdefault(target.path, []).append((acts, value))
             else:
                 _act(scope, acts, target, value)
+        scope.clock = None
     for name, given in cases.items():
         scope.discrete.give(name, _first(given, previous(DiscreteSymbol(name))))
 
@@ -65,7 +71,7 @@ class _Algorithm:
         self.once: dict[str, Value] = {}
 
     def names(self, name: str) -> Value:
-        return self.local[name] if name in self.local else self.scope.value(name)
+        return self.scope.interpreter.local_names(self.local, self.scope.value)(name)
 
     def carry_out(self, s: tree.Statement) -> None:
         if isinstance(s, tree.Effect):
@@ -156,7 +162,9 @@ def _each_action(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tup
         if isinstance(s, tree.Effect):
             name, arguments = s.call.function, s.call.arguments
             if name == "reinit":
-                yield scope.evaluate(arguments[0]), sympy.sympify(scope.evaluate(arguments[1]))
+                states, values = map(scope.evaluate, arguments)
+                for state, value in pairs(states, values):
+                    yield state, sympy.sympify(value)
             elif name == "terminate":
                 yield str(scope.evaluate(arguments[0])), None
         elif isinstance(s, tree.Equality | tree.Assignment):
@@ -172,7 +180,7 @@ def _each_action(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tup
 def _of_loops(scope: Scope, body: tuple[tree.Statement, ...]) -> Iterator[tuple[Target, Value]]:
     """What loops of equations assign."""
     local: dict[str, Value] = {}
-    scope.interpreter.execute(body, local, lambda n: local[n] if n in local else scope.value(n))
+    scope.interpreter.execute(body, local, scope.interpreter.local_names(local, scope.value))
     for n in with_entries(assigned_in(body), scope.flat.model):
         if n in scope.definitions.stored and n in local:
             yield DiscreteSymbol(n), local[n]

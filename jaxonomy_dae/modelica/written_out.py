@@ -48,12 +48,52 @@ def entries_of(
             e, place = e.entries[k - 1], place[1:]
         return e
 
+    def of_entry(modifiers: tree.Modifiers, place: tuple[int, ...]) -> tree.Modifiers:
+        return {k: of_entry(v, place) if isinstance(v, dict) else part(v, place) for k, v in modifiers.items()}
+
+    if 0 in sizes:  # the empty array is all that there is to know
+        yield d._replace(prefixes=frozenset({"constant"}), dimensions=(), value=_empty(sizes))
+        return
     for place in itertools.product(*(range(1, n + 1) for n in sizes)):
         yield d._replace(
             name=tree.entry_name(d.name, place), dimensions=(),
-            modifiers={k: v if isinstance(v, dict) else part(v, place) for k, v in d.modifiers.items()},
+            modifiers=of_entry(d.modifiers, place),
             value=None if d.value is None else part(d.value, place),
         )  # fmt: skip
+
+
+def fields_of(d: tree.Declaration, record: tree.Class) -> Iterator[tree.Declaration]:
+    """The declarations of the fields of a variable that is a record. What fields read of each other is what they read
+    of this variable."""
+    own = {f.name: tree.Reference((d.name, f.name), ((), ())) for f in record.declarations}
+    for f in record.declarations:
+        modifiers, value = _renamed((f.modifiers, f.value), own)
+        given = d.modifiers.get(f.name)
+        if isinstance(given, dict):
+            modifiers, value = modifiers | given, given.get("=", value)
+        elif given is not None:
+            value = given
+        yield f._replace(
+            prefixes=d.prefixes | f.prefixes, name=f"{d.name}.{f.name}", modifiers=modifiers, line=d.line,
+            value=value if d.value is None else tree.Part(d.value, f.name, ()),
+        )  # fmt: skip
+
+
+def _renamed(part: Any, names: Mapping[str, tree.Reference]) -> Any:
+    """A part of the tree with longer names for some variables."""
+    if isinstance(part, dict):
+        return {k: _renamed(v, names) for k, v in part.items()}
+    if isinstance(part, tree.Reference) and part.parts[0] in names:
+        longer, subscripts = names[part.parts[0]], _renamed(part.subscripts, names)
+        return tree.Reference((longer.parts[0], *part.parts), ((), *subscripts))
+    if isinstance(part, tuple):
+        parts = [_renamed(p, names) for p in part]
+        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+    return part
+
+
+def _empty(sizes: Sequence[int]) -> tree.Array:
+    return tree.Array((_empty(sizes[1:]),) * sizes[0] if sizes[0] else ())
 
 
 def _with(part: Any, values: Mapping[str, tree.Number]) -> Any:

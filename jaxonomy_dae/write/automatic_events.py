@@ -44,7 +44,7 @@ def smooth(expression: object) -> Expression:
     found = sympy.sympify(expression)
     if isinstance(expression, str) or not isinstance(found, sympy.Expr):
         raise ModelError(f"smooth takes an expression; got {expression!r}: write smooth(Max(u, 0)), for instance")
-    return found if found.is_number or isinstance(found, sympy.Symbol) else Smooth(found)
+    return found if isinstance(found, sympy.Symbol) else Smooth(found)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ from .arrays import ComponentArray, make_array
 from .connections import Connection, Signal, resolve_ends
 from .construction import Construction
 from .declarations import Account, Learned, Parameter, Value, Variable, full_name
+from .delay_declarations import Delay, DelayDeclarations
 from .energy_declarations import EnergyDeclarations
 from .environment import EqnEnv
 from .equations import residual_of
@@ -31,7 +32,7 @@ from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol
 ChildT = TypeVar("ChildT", bound="Component")
 
 
-class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metaclass=Construction):
+class Component(StartDeclarations, EnergyDeclarations, DelayDeclarations, ModeDeclarations, metaclass=Construction):
     """The base class of all components: subclass it, and declare physics in `__init__`.
 
     ```python
@@ -74,6 +75,7 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
         self.relations: list[float] = []
         self.as_written: dict[sympy.Expr, sympy.Expr] = {}
         self.held_branches: list[HeldBranch] = []
+        self.delays: list[Delay] = []
         self.accounts: list[Account] = []
         self.tree_branches: list[tuple[Port, Port]] = []  # whose overdetermined quantities the equations relate
         self.tree_roots: list[Port] = []  # whose overdetermined quantities the equations determine
@@ -540,7 +542,7 @@ class Component(StartDeclarations, EnergyDeclarations, ModeDeclarations, metacla
 # What `Component.__init__` sets. If one is missing, a subclass has not called it.
 _BASE_ATTRIBUTES = (
     *"ev name parent parameters variables ports children equations".split(),
-    *"learned_terms connections signals events discrete_equations relations as_written held_branches".split(),
+    *"learned_terms connections signals events discrete_equations relations as_written held_branches delays".split(),
     *"accounts tree_branches tree_roots".split(),
     *"_line _lines _sealed _solved".split(),
 )

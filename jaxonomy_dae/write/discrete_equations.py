@@ -16,7 +16,7 @@ not in the iteration before, and pre(m) otherwise (sections 8.3.5 and 11.2.7).
 
 import functools
 import graphlib
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import sympy
@@ -79,6 +79,7 @@ class DiscreteEquations:
         self.initial: DiscreteSymbol | None = None
         self.initially: dict[DiscreteSymbol, Truth] = {}
         self.ticks: dict[Sampled, DiscreteSymbol] = {}
+        self._sampled: dict[tuple[Sampled, Expression], DiscreteSymbol] = {}
         self._before: set[str] = set()
         self._hidden: dict[VariableSymbol, Expression] = {}
         self._conditions: list[tuple[VariableSymbol, DiscreteSymbol]] = []
@@ -112,6 +113,20 @@ class DiscreteEquations:
             tick = self.ticks[clock] = self.unshown(f":tick[{len(self.ticks)}]", 0.0)
             self.component._event(clock, (Assign(tick, sympy.Integer(1)),), None, NO_FLAG)
         return both(sympy.Eq(self.ticks[clock], 1), self.phase(STARTED))
+
+    def clock_of(self, conditions: Sequence[Truth]) -> Sampled | None:
+        """The clock at whose ticks alone one of some conditions becomes true; None if there are several or others."""
+        found = [c for c, tick in self.ticks.items() if any(tick in sympy.sympify(t).free_symbols for t in conditions)]
+        return found[0] if len(found) == 1 and all(map(self._is_tick, conditions)) else None
+
+    def at_ticks(self, clock: Sampled, value: Expression) -> DiscreteSymbol:
+        """A value as it is before anything happens at a tick, and at the initial time when that has settled."""
+        if (clock, value) not in self._sampled:
+            self.tick(clock)
+            before = self._sampled[clock, value] = self.unshown(f":sampled[{len(self._sampled)}]", 0.0)
+            # Events of one instant all read the values before it.
+            self.component._event(clock, (Assign(before, self.kept.in_discrete(value)),), None, NO_FLAG)
+        return self._sampled[clock, value]
 
     # --- what is gathered --------------------------------------------------------------------------------------------
 
@@ -233,7 +248,11 @@ class DiscreteEquations:
             *(Assign(self.before(m.path), n) for m, n in new.items()),
             *(Assign(self.before(m.path), m) for m in self.remembered),
             *(Assign(was, now) for now, was in self._conditions),
-            *(Assign(tick, _unless(pre(initial), pre(tick))) for tick in self.ticks.values()),
+            *(Assign(tick, _unless(pre(initial), sympy.Integer(0), pre(tick))) for tick in self.ticks.values()),
+            *(
+                Assign(s, _unless(pre(initial), pre(s), self.kept.in_discrete(v)))
+                for (_, v), s in self._sampled.items()
+            ),
             Assign(initial, sympy.Integer(STARTED)),
         ]
         # A run ends after the iteration whose body says so: first all other actions of it happen.
@@ -284,9 +303,10 @@ def _is(truth: VariableSymbol) -> Condition:
     return sympy.Ge(truth, sympy.Rational(1, 2))
 
 
-def _unless(initial: Expression, tick: Expression) -> Expression:
-    """A tick is over, but for one that is not looked at before the initial time has settled."""
-    return sympy.Piecewise((0, sympy.Eq(initial, STARTED)), (tick, True), evaluate=False)
+def _unless(initial: Expression, started: Expression, starting: Expression) -> Expression:
+    """One value from the time on at which the initial time has settled, and another one before. A tick is over, but for
+    one that is not looked at before; what is sampled at the initial time is what it is then."""
+    return sympy.Piecewise((started, sympy.Eq(initial, STARTED)), (starting, True), evaluate=False)
 
 
 def _first(cases: list[tuple[Condition, Truth]], otherwise: Expression) -> Expression:

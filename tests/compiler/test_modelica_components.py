@@ -218,7 +218,7 @@ def test_an_initial_algorithm_counts_at_its_end():
     "equations, told",
     [
         ("x = y(1.0);", "line 2: the function 'y' is not known"),
-        ("x = delay(x, 1.0);", "delay(…) needs the past"),
+        ("x = delay(x, time);", "delay(…) with the delay time, which changes, needs a third argument"),
         ("x = z;", "'z' is not declared"),
         ("x = ({1.0, 2.0})[3];", "the subscript 3 is outside of 1:2"),
         ("{x, x} = {1.0, 2.0, 3.0};", "differ in size"),

@@ -433,3 +433,17 @@ def test_a_table_over_time_is_zero_before_its_start():
     found = sympy.lambdify(t, table.value(1, t, True), "math")
     for at, expected in ((0.5, 0.0), (1.0, 6.0), (1.5, 6.5)):
         assert table.value(1, at, True) == found(at) == expected
+
+
+# --- delays -----------------------------------------------------------------------------------------------------------
+
+LATE = "model m parameter Real T = 0.5; Real x(start = 1, fixed = true); Real y; equation der(x) = -x; y = {}; end m;"
+
+
+def test_delays():
+    once = built(LATE.format("delay(x, T) + 2 * delay(x, T) + delay(3.0, T) + delay(x, 0)"))
+    assert [(str(d.longest), d.is_constant) for d in once.delays] == [("T", True)]
+    changing = built(LATE.format("delay(x, 0.2 + x, 2 * T)")).delays
+    assert [d.is_constant for d in changing] == [False]
+    with pytest.raises(ModelError, match="needs a third argument, the longest delay"):
+        built(LATE.format("delay(x, x)"))

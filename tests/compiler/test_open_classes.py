@@ -17,7 +17,6 @@ from jaxonomy_dae.host import kept
 from jaxonomy_dae.library import electrical, thermal
 from jaxonomy_dae.modelica import Library, component
 from jaxonomy_dae.modelica.__main__ import main
-from jaxonomy_dae.modelica.boolean_connections import with_single_connections
 from jaxonomy_dae.modelica.complex_sources import with_real_equations
 from jaxonomy_dae.modelica.front_end import FrontEnd
 from jaxonomy_dae.modelica.left_out import LEFT_OUT
@@ -287,7 +286,7 @@ def test_classes_are_data(library, tmp_path):
         packed.component("Devices.Load", m=2)
     with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
         archive.writestr("A.json", json.dumps({"format": 0}))
-    with pytest.raises(ModelError, match=r"this is no class of format 4: it has format 0"):
+    with pytest.raises(ModelError, match=r"this is no class of format 6: it has format 0"):
         Library(tmp_path / "c.zip")["A"]
     (tmp_path / "d.zip").write_bytes(b"none")
     with pytest.raises(ModelError, match=r"'.*d.zip' is not a file of packed classes"):
@@ -327,6 +326,41 @@ end Clutch;
     assert (copy / "Parts" / "Other" / "package.mo").read_text().startswith("within Parts;")
     (root / "Parts" / "Clutch.mo").write_text(clutch.replace("getTable1D", "getTable2D"))
     assert with_readable_sources([root], copies) == [root]
+
+
+def test_errors_under_a_condition_become_assertions(tmp_path):
+    """Lines stay where they are. What does more than to end the run stays as it is."""
+    controller = """within Parts;
+model Controller
+  parameter Real start = 0, low = -1, high = 1;
+  parameter Boolean begins = false;
+equation
+  if
+      begins and (start < low or
+      start > high) then
+    Modelica.Utilities.Streams.error("start (=" + String(start) + "; \\"y\\") is "
+      + String(low));
+  end if;
+  if begins then
+    x = 1;
+  else
+    Streams.error("no");
+  end if;
+end Controller;
+"""
+    root = tmp_path / "lib"
+    (root / "Parts").mkdir(parents=True)
+    (root / "Parts" / "package.mo").write_text("package Parts\nend Parts;\n")
+    (root / "Parts" / "Controller.mo").write_text(controller)
+    (tmp_path / "copies").mkdir()
+    [copy] = with_readable_sources([root], tmp_path / "copies")
+    new = (copy / "Parts" / "Controller.mo").read_text()
+    assert new.count("\n") == controller.count("\n")
+    assert new.splitlines()[11:] == controller.splitlines()[11:]
+    assert " ".join(new[new.index("assert") : new.index("if begins then")].split()) == (
+        'assert(not (begins and (start < low or start > high)), "start (=" + String(start) + "; \\"y\\") is " '
+        "+ String(low));"
+    )
 
 
 def test_a_library_is_packed_from_the_command_line(tmp_path, library, capsys):
@@ -417,41 +451,19 @@ def test_equations_of_complex_numbers_are_two_of_real_ones(text, tmp_path):
         assert eval(python, names) == pytest.approx(value, rel=1e-13), name
 
 
-def test_connections_of_arrays_of_boolean_connectors_are_loops(tmp_path):
-    source = """package Bank
-  connector Signal = input Boolean;
-  model Switch
-    Signal on;
-  end Switch;
-  model Group
-    Signal on[2];
-  end Group;
-  model Switches
-    parameter Integer m = 3;
-    Signal on[m];
-    Switch switch[m];
-    Group group, other;
-  equation
-    connect(on, switch.on);
-    connect(on[1], switch[1].on);
-    connect(group.on, other.on);
-  end Switches;
-end Bank;
-"""
-    (tmp_path / "Bank.mo").write_text(source)
-    new = with_single_connections(Sources([tmp_path]), source)
-    loop = "for k__ in 1:m loop connect(on[k__], switch[k__].on); end for;"
-    other = "for k__ in 1:size(group.on, 1) loop connect(group.on[k__], other.on[k__]); end for;"
-    expected = source.replace("connect(on, switch.on);", loop).replace("connect(group.on, other.on);", other)
-    assert new == expected
-
-
 def test_a_size_without_a_value_is_asked_for():
     text = "model Bank parameter Integer n; Real x[n]; equation x = fill(time, n); end Bank;"
     with pytest.raises(ModelError, match=r"gives no value to 'n', which decides its equations: component\(…, n=…\)"):
         component("Bank", source=text)
     declared = component("Bank", source=text, n=2).opened.flat.model.declarations
     assert [d.name for d in declared] == ["n", "x[1]", "x[2]"]
+
+
+def test_a_condition_without_a_value_is_asked_for():
+    text = "model Port parameter Boolean used(start = true); Real x = time if used; Real y = 1; end Port;"
+    with pytest.raises(ModelError, match=r"nothing says whether there is a 'x': the class gives no value"):
+        component("Port", source=text)
+    assert "x" in {d.name for d in component("Port", source=text, used=True).opened.flat.model.declarations}
 
 
 def test_parameters_that_decide_equations_are_not_symbols():

@@ -3,6 +3,7 @@
 import copy
 
 import pytest
+import sympy
 from modelica_sources import BALL, SOURCES, stored, without_places
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
@@ -164,7 +165,7 @@ end Plant;
 
 
 def test_sources_from_elsewhere(tmp_path):
-    """A byte order mark; a package in one file, of which one class is broken, and one needs what is not read."""
+    """A byte order mark; a package in one file, of which one class is broken, and one reads the past."""
     marked, file = tmp_path / "Lag.mo", tmp_path / "Plant.mo"
     marked.write_text("\ufeffmodel Lag\n  Real x;\nequation\n  x = time;\nend Lag;\n", encoding="utf-8")
     file.write_text(FOREIGN, encoding="utf-8")
@@ -172,5 +173,27 @@ def test_sources_from_elsewhere(tmp_path):
         assert [d.name for d in load(path, model).model.declarations] == ["x"]
     with pytest.raises(ModelError, match=r"line 3: the type reference 'Unknown\.Part' is not found"):
         load(file, "Plant.Broken")
-    with pytest.raises(ModelError, match=r"line 8: delay\(…\) needs the past"):
-        FlatComponent(EqnEnv(), "m", load(file, "Plant.Late"))
+    assert [d.is_constant for d in FlatComponent(EqnEnv(), "m", load(file, "Plant.Late")).delays] == [True]
+
+
+def test_ranges_that_fall_and_the_order_of_iterators():
+    """All values of 3:-1:1 count, the last iterator counts the rows (Modelica Language Specification 3.6, section
+    10.4.1.1), and a function of scalars is applied to the entries of arrays (section 12.4.6)."""
+    source = """package P
+  function square input Real u; output Real y; algorithm y := u * u; end square;
+  function rows input Real u; output Real y[2, 2]; algorithm y := {i + 10 * j * u for i in 1:2, j in 1:2}; end rows;
+  model M
+    Real a[3], b[2], c[2, 2], d;
+  equation
+    for i in 3:-1:1 loop a[i] = i * time; end for;
+    b = square({time, 2 * time});
+    c = rows(time);
+    d = sum({10 * time * k for k in 3:-2:1});
+  end M;
+end P;
+"""
+    c = FlatComponent(EqnEnv(), "m", load(source, "P.M"))
+    found = {str(s): v for e in c.equations for s, v in sympy.solve(e.subs(c.ev.t, 1), dict=True)[0].items()}
+    assert [found[f"a[{k}]"] for k in (1, 2, 3)] == [1, 2, 3]
+    assert [found["b[1]"], found["b[2]"], found["d"]] == [1, 4, 40]
+    assert [found[f"c[{i},{j}]"] for i in (1, 2) for j in (1, 2)] == [11, 12, 21, 22]

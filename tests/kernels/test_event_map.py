@@ -48,7 +48,7 @@ def after(x, numbers):
         slope, jnp.zeros((GUARDS,)), due, jnp.zeros((GUARDS,), bool), jnp.ones((GUARDS,)), jnp.asarray(1e-6),
         jnp.asarray(1.0),
     )  # fmt: skip
-    new, _, noted = handle(problem, t, eqx.tree_at(lambda s: s.x, state, x), arrival, None, state.table)
+    new, _, noted, _ = handle(problem, t, eqx.tree_at(lambda s: s.x, state, x), arrival, None, state.table)
     return new.x, noted.log[0, 0]
 
 

@@ -267,6 +267,21 @@ def test_slopes_that_jax_has_otherwise():
             np.testing.assert_allclose([value, slope, curve], np.array(expected, float), rtol=1e-12, atol=1e-15)
 
 
+def test_the_second_derivative_of_a_power_at_zero():
+    """x^p at x = 0 with p = 1, 2 and 3 in forward mode twice, by x and by p; at x = −2 by x alone."""
+    x, p = sympy.symbols("x p")
+    kernel = Kernel([read(x**p, str)], ["x", "p"])
+
+    def slope(x, p):
+        return jax.jvp(lambda v: kernel([v, p])[0], (x,), (1.0,))[1]
+
+    for exponent, curve in ((1.0, 0.0), (2.0, 2.0), (3.0, 0.0)):
+        value, by_x = jax.jvp(slope, (0.0, exponent), (1.0, 0.0))
+        assert (value, by_x) == (float(exponent == 1), curve)
+        assert jnp.isfinite(jax.jvp(slope, (0.0, exponent), (0.0, 1.0))[1])
+        assert jax.grad(lambda v, n=exponent: kernel([v, n])[0])(-2.0) == exponent * (-2.0) ** (exponent - 1)
+
+
 def test_what_is_not_a_number_stays_so():
     x, y = sympy.symbols("x y")
     for f in (hypot(x, y), sympy.Heaviside(x)):

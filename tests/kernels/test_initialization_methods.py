@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 import pytest
-from problems import compiled, pendulum
-from sympy import Eq, atan
+from problems import compiled, component, pendulum
+from sympy import Abs, Eq, atan
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, der, simulate
 from jaxonomy_dae.run.start import initialize as initialization
@@ -202,6 +202,33 @@ def test_a_models_own_equation(law, guess, method, root):
     system = compiled(Law(EqnEnv(), "c", law, z=guess))
     assert system.initialization_report().method == method
     assert float(system.observe("c.z", 0.0, system.initialize())) == pytest.approx(root, abs=1e-12)
+
+
+@pytest.mark.parametrize("traced", [False, True], ids=["outside", "in a program"])
+def test_what_nobody_guessed_follows_from_other_equations(traced):
+    """A core whose permeability, permeance and reluctance nobody guessed: at zero the reluctance has no value. Without
+    flux it is l/(µ0·1210·A)."""
+
+    def saturating(core, ev):
+        names = "flux", "iron", "leak", "density", "share", "mu", "permeance", "reluctance", "magnet"
+        flux, iron, leak, density, share, mu, permeance, reluctance, magnet = map(core.variable, names)
+        current, length = core.variable("current", start=0.0, fixed=True), core.parameter("length", 0.26)
+        core.add_equations(
+            Eq(flux, iron + leak), Eq(600 * current, magnet + 1.27e5 * iron), Eq(600 * current, 1.2e6 * leak),
+            Eq(density, iron / 6.25e-4), Eq(share, Abs(density / 1.16)), Eq(magnet, iron * reluctance),
+            Eq(mu, 1 + (1209 + 24630 * share) / (1 + 2.44 * share + share**14)),
+            Eq(permeance, 1.25663706212e-6 * mu * 6.25e-4 / length), Eq(reluctance, 1 / permeance),
+            Eq(600 * der(flux), 325 - 7.5 * current),
+        )  # fmt: skip
+
+    system = compiled(component(saturating))
+
+    def start(length):
+        point = simulate(system.with_parameters({"c.length": length}), 1e-6, ts=jnp.array([0.0]))
+        return jnp.stack([point["c.reluctance"][0], point["c.flux"][0]])
+
+    found = np.asarray((jax.jit(start) if traced else start)(0.26))
+    np.testing.assert_allclose(found, [0.26 / (1.25663706212e-6 * 1210 * 6.25e-4), 0.0], rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.slow

@@ -122,6 +122,28 @@ def test_an_fmu_inside_a_diagram(decay):
     np.testing.assert_allclose(solution["f.d_x"], 2 + 2 * np.exp(-t) - 2 * np.exp(-t / 2), atol=1e-7)
 
 
+class Resting(Component):
+    """x' = u − k·x at rest at first, so that x = u/k."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        k, u, x = self.parameter("k", 0.5), self.input("u", default=0.0), self.variable("x")
+        self.add_equations(Eq(der(x), u - k * x))
+        self.initially(Eq(der(x), 0))
+
+
+@pytest.mark.slow
+def test_the_start_of_an_fmu_depends_on_its_inputs(tmp_path):
+    """The states at the start were those for the inputs that the FMU names."""
+    path = compiled(Resting(EqnEnv(), "d")).export_fmu(tmp_path / "resting.fmu", kinds=["model_exchange"])
+    fmu = Described(path, "f: ")
+    calls = Calls(fmu, [], ["d.k"])
+    assert calls.starts_of([0.5])[0] == 0
+    np.testing.assert_allclose(calls._starts(np.array([0.0, 3.0, 0.5])), [6.0])
+    np.testing.assert_allclose(calls._jacobian_of_starts(np.array([0.0, 3.0, 0.5])), [[0.0, 2.0, -12.0]], atol=1e-6)
+    np.testing.assert_allclose(calls._values(Point(0.0, np.array([1.0]), np.array([3.0]), (0.5,), 0)), [2.5])
+
+
 # --- events ---------------------------------------------------------------------------------------------------------
 
 FALL, G = np.sqrt(2 / 9.81), 9.81

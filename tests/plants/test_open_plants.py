@@ -10,7 +10,7 @@ from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, keep_programs,
 from jaxonomy_dae.host import kept
 from jaxonomy_dae.library import electrical, thermal
 from jaxonomy_dae.library.signal import Step
-from jaxonomy_dae.modelica import Library
+from jaxonomy_dae.modelica import Library, component
 
 
 @pytest.fixture(scope="module")
@@ -68,3 +68,41 @@ def test_a_capacitor_is_charged_through_a_switch_and_a_heated_resistor(library):
     expected = jax.grad(lambda q: jnp.sum(closed(q)[:3] ** 2))(values)
     for name in values:
         np.testing.assert_allclose(slopes[name], expected[name], rtol=1e-5, err_msg=name)
+
+
+def test_what_flows_through_a_connector_is_not_zero_in_semi_linear():
+    """The front end takes flows of loose connectors for zero: H = semiLinear(m, h, inside) was read as h = inside."""
+    text = """
+record Medium parameter Real cp = 1; end Medium;
+connector Port parameter Medium medium; Real p; flow Real m; Real h; flow Real H; end Port;
+model Source
+  parameter Real p0, h0;
+  Port port;
+  Real inside;
+equation
+  port.p = p0;
+  inside = h0;
+  port.H = semiLinear(port.m, port.h, inside);
+end Source;
+model Pipe
+  Port a, b;
+  Real inside;
+equation
+  a.m + b.m = 0;
+  a.p - b.p = a.m;
+  a.H + b.H = 0;
+  a.H = semiLinear(a.m, a.h, inside);
+  b.H = semiLinear(b.m, b.h, inside);
+end Pipe;
+"""
+    Source, Pipe = (component(n, source=text) for n in ("Source", "Pipe"))
+    ev, d = EqnEnv(), AcausalDiagram()
+    one, two, pipe = Source(ev, "one", p0=3.0, h0=5.0), Source(ev, "two", p0=1.0, h0=7.0), Pipe(ev, "pipe")
+    d.add(one, two, pipe)
+    d.connect(one.port, pipe.a)
+    d.connect(pipe.b, two.port)
+    system = AcausalCompiler(ev, d)()
+    names = ["pipe.inside", "pipe.b.h", "one.port.H", "two.port.H"]
+    for p, expected in ((1.0, [5.0, 5.0, -10.0, 10.0]), (4.0, [7.0, 7.0, 7.0, -7.0])):
+        solution = simulate(system.with_parameters({"two.p0": p}), 1.0, ts=jnp.array([1.0]))
+        np.testing.assert_allclose(solution[names][0], expected, rtol=1e-9)

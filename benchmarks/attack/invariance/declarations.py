@@ -289,6 +289,7 @@ class Two(tuple):
 X = lambda s, self: s.x  # noqa: E731
 Y = lambda s, self: s.y  # noqa: E731
 SLOPE = lambda s, self: s.slope  # noqa: E731
+STATE = lambda s, self: s.x  # noqa: E731
 
 # For each argument of each public declaration, two models that differ in it alone, and whether that is structure, a
 # value (then one program serves both), or nothing that remains (a check).
@@ -324,6 +325,11 @@ PAIRS: dict[str, tuple[tuple[Any, Any], str]] = {
     "output.name": (pair(outputs, Two("o", "w")), STRUCTURE),
     "output.expr": (pair(outputs, "o", Two(2.0, 3.0)), STRUCTURE),
     "output.unit": (pair(outputs, "o", 2.0, unit=Two("m", "km")), STRUCTURE),
+    "delayed.name": (pair(calls, "delayed", Two("u", "w"), STATE, 0.5), STRUCTURE),
+    "delayed.expression": (pair(calls, "delayed", "u", Two(STATE, lambda s, self: s.y), 0.5), STRUCTURE),
+    "delayed.time": (pair(calls, "delayed", "u", STATE, Two(0.5, 0.25)), STRUCTURE),
+    "delayed.longest": (pair(calls, "delayed", "u", STATE, 0.5, longest=Two(1.0, 2.0)), STRUCTURE),
+    "delayed.unit": (pair(calls, "delayed", "u", STATE, 0.5, unit=Two("m", "km")), STRUCTURE),
     "port.name": (pair(ports, Electrical, Two("p", "q")), STRUCTURE),
     "port.domain": (pair(ports, Two(Electrical, Thermal)), STRUCTURE),
     "port.nominal": (pair(ports, Electrical, nominal=Two({"i": 1.0}, {"i": 1e-3})), STRUCTURE),

@@ -17,6 +17,7 @@ from .entry_sizes import EntrySizes
 from .gather import NOTHING
 from .live_relations import without_live_relations
 from .plan import InputTable, PlannedRow, SystemPlan
+from .plan_delays import plan_delays
 from .plan_events import plan_events, plan_held
 from .plan_waves import plan_waves
 from .program import Layout, Program, plan, plan_equation
@@ -62,6 +63,11 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         lambda q: program(needed(steps, q, n)),
     )
     held = plan_held(flat.held, variable_map, lambda q: program(needed(steps, q, n)))
+    delays = None
+    if events is not None and len(flat.delays):
+        delays = plan_delays(flat, events.table, variable_map, extended, steps, lambda q: program(needed(steps, q, n)))
+        assert delays is not None
+        events = dataclasses.replace(events, facts=dataclasses.replace(events.facts, delays=delays.facts))
     watched = [] if events is None else [variable_map.quantity[events.table.guard[events.n_clocks :]]]
     row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]
     following = state_order + 1
@@ -102,6 +108,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         events=events,
         held=held,
         waves=waves,
+        delays=delays,
     )
 
 

@@ -24,6 +24,7 @@ from ..passes.order_blocks import Blocks
 from ..passes.select_states import StateSelection
 from . import pattern
 from .gather import Gather
+from .plan_delays import DelayPlan
 from .plan_events import EventPlan, HeldPlan
 from .plan_waves import WaveGroup
 from .program import PlannedEquation, Program, plan
@@ -119,6 +120,7 @@ class SystemPlan:
     events: EventPlan | None
     held: HeldPlan | None  # constraints that come and go with modes
     waves: tuple[WaveGroup, ...]  # that states, conditions and constraints depend on
+    delays: DelayPlan | None  # of what is delayed
 
     def __eq__(self, other):
         return self is other or (isinstance(other, SystemPlan) and self._identity == other._identity)
@@ -145,6 +147,11 @@ class SystemPlan:
         """The plan of events, of a model that has some."""
         assert self.events is not None
         return self.events
+
+    def refuse_delays(self, why: str) -> None:
+        """Raises a `ModelError` if something is delayed."""
+        if self.delays is not None:
+            raise ModelError(f"'{self.delays.table.text[0]}' is delayed, and {why}")
 
     @property
     def flat(self) -> FlatModel:

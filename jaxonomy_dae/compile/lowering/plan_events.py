@@ -181,7 +181,7 @@ def _reads(flat: FlatModel, variables: QuantityMap, steps: Sequence[AnyStep], n:
     if not (table.discrete >= 0).any():  # there is nothing to read
         return out
     place = {int(p): k for k, p in enumerate(flat.parameters.discrete)}
-    behind = _Behind(steps, n)
+    behind = Behind(steps, n)
     for event, value in zip(table.event.tolist(), table.value.tolist(), strict=True):
         is_relation = event >= table.n_clocks and EventFlag.RELATION in table.events[event].flags
         if value >= 0 and not is_relation:
@@ -189,7 +189,7 @@ def _reads(flat: FlatModel, variables: QuantityMap, steps: Sequence[AnyStep], n:
     return out
 
 
-class _Behind:
+class Behind:
     """What the steps read to determine each quantity; a quantity is looked into when it is first asked for."""
 
     def __init__(self, steps: Sequence[AnyStep], n: int):

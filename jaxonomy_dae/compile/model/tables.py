@@ -14,6 +14,7 @@ from jaxtyping import Bool
 from ...base.aliases import Numeric
 from ...write.interval import Interval
 from .array_names import ArrayNames
+from .delays import NO_DELAYS, DelayTable
 from .events import NO_EVENTS, NONE_HELD, EventTable, HeldTable
 from .group import Group
 from .names import Names, Paths
@@ -208,6 +209,7 @@ class FlatModel:
     held: HeldTable = NONE_HELD
     accounts: tuple[AccountGroup, ...] = ()
     arrays: ArrayNames = ArrayNames()
+    delays: DelayTable = NO_DELAYS
 
     @property
     def declares(self) -> Declared:

@@ -1,6 +1,7 @@
 """The events of all components, as one table."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -36,12 +37,6 @@ def event_table(model: ModelNumbers) -> EventTable:
     def parameter(i: Instances, path: str, row: int) -> int:
         return int(parameters(i, path)[row])
 
-    def in_parameters(i: Instances, row: int, expression: sympy.Expr) -> Start:
-        # A set of symbols has another order in each process.
-        symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: parameter(i, s.path, row))
-        graph = read_expression(expression, model.paths[i.number[row]])
-        return Start(canonical(graph, (), symbols), tuple(parameter(i, s.path, row) for s in symbols))
-
     def write(i: Instances, row: int, action: Reinit | Assign, value: str | float) -> Write:
         target = action.target.path
         is_name = isinstance(value, str)
@@ -54,12 +49,14 @@ def event_table(model: ModelNumbers) -> EventTable:
 
     def event(k: int, i: Instances, row: int, when: When) -> Event:
         clock = when.clock
-        period = None if clock is None or clock.period is None else in_parameters(i, row, clock.period)
+        period = (
+            None if clock is None or clock.period is None else in_parameters(model, parameter, i, row, clock.period)
+        )
         return Event(
             owner=model.paths[k],
             condition=when.text,
             guard=-1 if when.guard is None else variable(i, when.guard, row),
-            clock=None if clock is None else (period, in_parameters(i, row, clock.offset)),
+            clock=None if clock is None else (period, in_parameters(model, parameter, i, row, clock.offset)),
             message=next((a.message for a in when.actions if isinstance(a, Terminate)), None),
             flags=when.flags,
             writes=tuple(
@@ -70,6 +67,16 @@ def event_table(model: ModelNumbers) -> EventTable:
         )
 
     return EventTable(tuple(event(k, i, row, when) for k, _, i, row, when in found), left_alone)
+
+
+def in_parameters(
+    model: ModelNumbers, parameter: Callable[[Instances, str, int], int], i: Instances, row: int, expression: sympy.Expr
+) -> Start:
+    """An expression in parameters of one instance; `parameter` numbers these."""
+    # A set of symbols has another order in each process.
+    symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: parameter(i, s.path, row))
+    graph = read_expression(expression, model.paths[i.number[row]])
+    return Start(canonical(graph, (), symbols), tuple(parameter(i, s.path, row) for s in symbols))
 
 
 def _left_alone(model: ModelNumbers) -> tuple[str, ...]:

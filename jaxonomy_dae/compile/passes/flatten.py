@@ -11,6 +11,7 @@ from ...write.diagram import AcausalDiagram
 from ..model.tables import Declared, EquationGroup, FlatModel
 from .add_networks import add_corrections, add_learned_terms
 from .collect_declarations import parameter_table, variable_table
+from .collect_delays import delay_table
 from .collect_events import event_table, held_table
 from .connect_ports import connect_ports
 from .connect_signals import connect_signals
@@ -43,5 +44,5 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     name = diagram.name or ""
     return FlatModel(
         variables, parameters, groups, Declared(values, networks), tuple(networks), rows, model.paths, ports, name,
-        events, held, accounts, array_names(model),
+        events, held, accounts, array_names(model), delay_table(model),
     )  # fmt: skip

@@ -18,6 +18,7 @@ import jax.scipy.special as jsp
 import numpy as np
 import scipy.special as ssp
 import sympy
+from jax.custom_derivatives import SymbolicZero
 from sympy.codegen import cfunctions
 
 from ...base.aliases import Numeric
@@ -100,6 +101,29 @@ def _with_slope(function, slope):
 
     found.defjvps(lambda moved, _, x: slope(x) * moved)
     return found
+
+
+@jax.custom_jvp
+def real_power(base: Numeric, exponent: Numeric) -> Numeric:
+    """The power in JAX. JAX's own second derivative at zero is 0·0⁻¹ where the exponent is one."""
+    return jnp.power(base, exponent)
+
+
+def _power_moved(primals, tangents):
+    base, exponent = primals
+    found, moved = real_power(base, exponent), []
+    by_base, by_exponent = tangents
+    if not isinstance(by_base, SymbolicZero):
+        flat = exponent == 0
+        slope = real_power(base, jnp.where(flat, 1.0, exponent - 1.0))
+        moved.append(jnp.where(flat, 0.0, exponent * slope) * by_base)
+    if not isinstance(by_exponent, SymbolicZero):
+        # Where only the base moves, there is no logarithm of it, which may be negative.
+        moved.append(jnp.log(jnp.where(base == 0, 1.0, base)) * found * by_exponent)
+    return found, sum(moved, jnp.zeros_like(found))
+
+
+real_power.defjvp(_power_moved, symbolic_zeros=True)
 
 
 def _polygamma(special, n, x):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...base.aliases import Numeric
 from .branches import before, guards
-from .functions import TABLE
+from .functions import TABLE, real_power
 from .node import Node, Number, as_float, postorder
 
 _BACKENDS: dict[str, Any] = {"numpy": np, "jax": jnp}
@@ -131,7 +131,7 @@ def _operation(node: Node, xp: ModuleType, backend: str) -> _Operation:
     if operation in TABLE:
         return getattr(TABLE[operation], backend)
     return {
-        "power": xp.power,
+        "power": real_power if backend == "jax" else xp.power,
         "select": xp.where,
         "less": lambda a, b: xp.less(a, b),
         "less_equal": lambda a, b: xp.less_equal(a, b),

@@ -11,6 +11,11 @@ class Smooth(sympy.Function):
 
     nargs = 1
 
+    @classmethod
+    def eval(cls, argument):
+        # A number has no relation that could become an event, and SymPy compares no marked one, as Max does.
+        return argument if argument.is_number else None
+
     def fdiff(self, argindex=1):
         return sympy.Integer(1)
 

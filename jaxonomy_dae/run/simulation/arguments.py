@@ -102,6 +102,7 @@ def check_start(system: AcausalSystem, t0: Time, t1: Time, ts: Times, initial: P
         check_initial(system, initial)
     _check_interval(initial_time(t0, initial), t1, ts, system.parameters.values.dtype)
     _check_periods(system)
+    _check_delays(system, initial)
 
 
 def _note_single_precision(system: AcausalSystem) -> None:
@@ -145,6 +146,27 @@ def _check_periods(system: AcausalSystem):
         raise ModelError(
             f"'{name}': the period must be positive; it is {periods[bad[0]]:g}. Set it with with_parameters"
         )
+
+
+def _check_delays(system: AcausalSystem, initial: PyTree) -> None:
+    delays = system.plan.delays
+    if delays is None:
+        return
+    if isinstance(initial, SavedState):
+        raise ModelError(
+            f"initial: '{delays.table.text[0]}' is delayed, and the state of another run does not hold its past: run "
+            "from the beginning"
+        )
+    known = eqx.tree_at(lambda s: s.parameters, system, still(system.parameters))
+    point = SystemAt(system.plan, known.numbers, (), 0.0, {}, system.typical_sizes)
+    longest = _concrete(point.longest_delays())
+    if longest is None or (longest > 0).all():
+        return
+    bad = int(np.flatnonzero(~(longest > 0))[0])
+    raise ModelError(
+        f"the delay of '{delays.table.text[bad]}' must be positive; it is {longest[bad]:g} s. Set it with "
+        "with_parameters"
+    )
 
 
 def _concrete(value: object) -> np.ndarray | None:
@@ -219,6 +241,9 @@ def are_admitted(system: AcausalSystem, inputs: Inputs, t0: Time, t1: Time) -> B
     finite = [jnp.isfinite(leaf).all() for leaf in leaves]
     fit = [samples_fit(inputs, t0, t1)] if any(isinstance(s, SampledInput) for s in data) else []
     # Backwards, clocks would not tick, and conditions become true where they cease to be.
+    if system.plan.delays is not None:
+        point = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes)
+        fit.append(jnp.all(jnp.asarray(point.longest_delays()) > 0))
     return jnp.stack([system.parameters.are_admitted, t0 <= t1, *finite, *fit]).all()
 
 

@@ -17,7 +17,7 @@ from ...compile.model.events import Event
 from ...host.members import is_batched
 from ...host.staging import is_traced, layers
 from ...solve.events.rivals import pair_of
-from ...solve.events.solver import CLASH, MOVED, STUCK, TOO_MANY
+from ...solve.events.solver import CLASH, FORGETS, MOVED, STUCK, TOO_MANY, VANISHED
 from ...solve.methods.choice_guard import SINGULAR_CHOICE
 from ...solve.methods.failures import SHOWN, Stopped, explain_failure, how_it_stopped
 from ...solve.methods.switching import STIFF
@@ -64,6 +64,8 @@ def codes(result: Result, has_events: bool, max_steps: int, max_events: int) -> 
         (CLASH, "two events give one variable different values at one instant"),
         (NOT_ADMITTED, TEXT),
         (SINGULAR_CHOICE, "the states have become a singular choice"),
+        (VANISHED, "a delay has become negative, or too short for what it reads"),
+        (FORGETS, "the record of what is delayed has too little room for the steps within the longest delay"),
         (
             of_diffrax.nonlinear_divergence,
             f"{lost}, or an event wrote a value that is not finite" if has_events else lost,
@@ -107,6 +109,8 @@ def explain(solution: Solution, at: Stopped, x0: State, implicit: bool, max_even
     of_event = _of_event(solution, at, max_events)
     if of_event:
         return of_event
+    if at.result == VANISHED or at.result == FORGETS:
+        return stopped + _of_delays(system, at, inputs)
     if at.result == STIFF:
         return (
             f"{stopped}the system is stiff. From there on stability, not accuracy, limits explicit steps, so that "
@@ -154,6 +158,28 @@ def explain(solution: Solution, at: Stopped, x0: State, implicit: bool, max_even
     if domain:
         return f"{stopped}{domain}."
     return explain_failure(term_of(system, implicit), inputs, [*system.states, *system.carried], at, not implicit)
+
+
+def _of_delays(system: AcausalSystem, at: Stopped, inputs: Inputs) -> str:
+    """Why a run with delays stopped."""
+    delays = system.plan.delays
+    assert delays is not None
+    point = system.at(at.t, inputs)
+    if at.result == FORGETS:
+        longest = np.asarray(point.longest_delays(), float)
+        k = int(np.argmax(longest))
+        return (
+            f"more steps lie within the longest delay, that of '{delays.table.text[k]}' ({longest[k]:g} s), than "
+            "max_steps admits or a record inside jit, grad and vmap has room for. Ask for less accuracy (rtol, atol), "
+            "so that steps are longer"
+        )
+    delay = float(at.t) - np.asarray(point.delayed(at.y)[1], float)
+    k = int(np.argmin(delay))
+    return (
+        f"the delay of '{delays.table.text[k]}' is {delay[k]:.3g} s and becomes negative, or it is so short that what "
+        "it reads follows itself without one. Only the past can be read: let the delay stay positive, for instance "
+        "Max(time, least)"
+    )
 
 
 def _of_event(solution: Solution, at: Stopped, max_events: int) -> str:

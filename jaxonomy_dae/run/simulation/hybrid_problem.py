@@ -1,17 +1,21 @@
 """A compiled system as a problem with events."""
 
+import dataclasses
+
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ...base.aliases import Args, State, Time, Tolerance
+from ...base.aliases import Args, Controller, State, Time, Tolerance
 from ...base.tolerances import CONSISTENT, RESOLUTION
 from ...compile.lowering.plan_events import EventPlan
 from ...solve.adjoint.resting import still
 from ...solve.events.facts import EventFacts
-from ...solve.events.problem import AbstractHybridProblem
+from ...solve.events.past import Past, begin_due
+from ...solve.events.problem import AbstractHybridProblem, HybridState
 from ...solve.methods.switching import Watch
 from ...write.events import EventFlag
 from ..start.after_event import with_blocks_solved
@@ -34,6 +38,8 @@ class SystemProblem(AbstractHybridProblem):
     resolution: Time
     implicit: bool = eqx.field(static=True)
     facts: EventFacts = eqx.field(static=True)
+    ticks: Array | None = None  # when the breaks come out of delays that do so now
+    record: tuple[Tolerance, Tolerance] | None = None  # (atol, rtol) of the record of what is delayed
 
     @property
     def events(self) -> EventPlan:
@@ -57,7 +63,51 @@ class SystemProblem(AbstractHybridProblem):
         return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
     def at_instant(self, args):
-        return (from_then_on(args, self.resolution), any_held(args)) if args else (args, False)
+        problem, past = self, self.system.past
+        if past is not None:
+            problem = self.remembering(past.past.onwards(self.resolution), self.ticks)
+        then, may_jump = (from_then_on(args, self.resolution), any_held(args)) if args else (args, False)
+        return problem, then, may_jump
+
+    def remembering(self, past, ticks=None):
+        return dataclasses.replace(self, system=dataclasses.replace(self.system, past=past), ticks=ticks)
+
+    def due(self, ticks):
+        due = super().due(ticks)
+        if self.ticks is None or self.facts.delays is None:
+            return due
+        return due.at[np.array(self.facts.delays.clocks)].set(self.ticks)
+
+    def sources(self, t, x, q, args):
+        values, instants = self.system.holding(q).at(t, args).delayed(x)
+        return values, instants
+
+    def longest(self):
+        system = self.system
+        return SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes).longest_delays()
+
+    def allowed(self, size):
+        delays = self.system.plan.delays
+        assert delays is not None and self.record is not None
+        quantity = self.system.plan.variable_map.quantity[delays.table.source]
+        atol, rtol = self.record
+        return rtol * size + atol * self.system.typical_sizes[quantity]
+
+    def with_past_read(self, t, x, q, args):
+        delays = self.system.plan.delays
+        if delays is None:
+            return q
+        return q.at[delays.table.read].set(self.system.holding(q).at(t, args).past_read(x))
+
+    def with_past(self, t0: Time, y0: HybridState, args: Args, room: int) -> HybridState:
+        """The state in which a run begins, with room for so many steps within the longest delay."""
+        delays = self.facts.delays
+        if delays is None:
+            return y0
+        first, instants = self.sources(t0, y0.x, y0.q, args)
+        past = Past.begin(t0, first, t0 - instants, room)
+        q = y0.q.at[np.array(delays.begins)].set(0.0)
+        return y0.but(q=q, past=past, due=begin_due(delays, t0, t0 - instants, y0.due))
 
     def written(self, t, x, read, q, previous, events, args):
         plan = self.events
@@ -114,8 +164,9 @@ def resolution(t0: Time, t1: Time) -> Time:
 
 
 def problem_for(
-    system: AcausalSystem, t0: Time, t1: Time, implicit: bool, watch: Watch | None, tolerance: Tolerance
-) -> SystemProblem:
+    system: AcausalSystem, t0: Time, t1: Time, implicit: bool, watch: Watch | None, tolerance: Tolerance,
+    record: tuple[Tolerance, Tolerance] | None = None,
+) -> SystemProblem:  # fmt: skip
     """The problem of a system that has events, to be run from t0 to t1."""
     events = system.plan.some_events
     return SystemProblem(
@@ -125,6 +176,7 @@ def problem_for(
         resolution=resolution(t0, t1),
         implicit=implicit,
         facts=events.facts,
+        record=record,
     )
 
 
@@ -138,3 +190,31 @@ def without_clocked(system: AcausalSystem, q: Array) -> Array:
     if not len(chosen):
         return q
     return q.at[chosen].set(jnp.asarray(system.plan.flat.parameters.starts_of(events.discrete[chosen]), q.dtype))
+
+
+def saved_with_events(t: Time, y: HybridState, args: Args) -> State:
+    """What is saved of a state: (x, q, the sides of guards and the counts of ticks)."""
+    return y.x, y.q, jax.lax.stop_gradient(jnp.concatenate([y.armed, y.ticks]))
+
+
+class SavedWithPast(eqx.Module):
+    """What is saved of a state with a past: discrete values have what equations read of it."""
+
+    problem: SystemProblem
+
+    def __call__(self, t: Time, y: HybridState, args: Args) -> State:
+        return saved_with_events(t, y.but(q=self.held(t, y, args)), args)
+
+    def held(self, t: Time, y: HybridState, args: Args) -> Array:
+        """The discrete values at a time."""
+        problem = self.problem.remembering(y.past.onwards(self.problem.resolution))
+        return problem.with_past_read(t, y.x, y.q, args)
+
+
+def tolerances_of_a_record(controller: Controller, atol: Tolerance) -> tuple[Tolerance, Tolerance]:
+    """The absolute and the relative tolerance of a record of what is delayed; where steps are prescribed, all is as
+    exact as they are."""
+    while isinstance(controller, diffrax.ClipStepSizeController):
+        controller = controller.controller
+    rtol = getattr(controller, "rtol", None)
+    return (1e30, 1.0) if rtol is None else (atol, jax.lax.stop_gradient(rtol))

@@ -29,7 +29,14 @@ from ..system.system import AcausalSystem
 from .arguments import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .from_state import from_state
-from .hybrid_problem import SystemProblem, problem_for, without_clocked
+from .hybrid_problem import (
+    SavedWithPast,
+    SystemProblem,
+    problem_for,
+    saved_with_events,
+    tolerances_of_a_record,
+    without_clocked,
+)
 from .preparation import SAVED_ITERATIONS, largest_tolerance, prepared, term_of
 from .saved_state import Memory, SavedState, same_time
 from .step_sizes import first_step
@@ -58,6 +65,7 @@ class Options(eqx.Module):
     max_events: int = eqx.field(static=True, default=0)
     room: int = eqx.field(static=True, default=0)  # for so many events in the log
     save_events: bool = eqx.field(static=True, default=False)
+    remembered: int = eqx.field(static=True, default=0)  # so many steps within the longest delay
 
 
 class Outcome(eqx.Module):
@@ -166,11 +174,14 @@ def run(
         discrete = jnp.where((rows.filled & consistent)[:, None], discrete, jnp.nan)
     end: HybridState = done.last[1]
     with_events = parts.problem is not None
+    held = end.q if with_events else None
+    if isinstance(fn, SavedWithPast):
+        held = fn.held(done.last[0], end, given.inputs)
     return Outcome(
         found=begin.found._replace(jacobian=None), ts=rows.ts, x=x, last=rows.last, stats=done.stats,
         result=_result(given, parts, done.result, rows, consistent),
         is_stiff=consistent & (done.result == STIFF) if watch is not None else jnp.array(False), discrete=discrete,
-        events=EventLog.of(end) if with_events else None, held=end.q if with_events else None, memory=rows.memory,
+        events=EventLog.of(end) if with_events else None, held=held, memory=rows.memory,
     )  # fmt: skip
 
 
@@ -204,7 +215,9 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
     system, t0, t1, inputs, controller = begin.system, given.t0, given.t1, given.inputs, options.controller
     x0, admitted, consistent = begin.found.x, begin.admitted, is_consistent(begin.found)
     implicit, prescribed = is_implicit(options.solver), isinstance(controller, diffrax.StepTo)
-    chosen = options.solver if given.ts is None else right_between_steps(options.solver)
+    # What is delayed is recorded along the dense output, too.
+    ends_count = given.ts is None and system.plan.delays is None
+    chosen = options.solver if ends_count else right_between_steps(options.solver)
     tolerance = largest_tolerance(system, controller)
     solver = prepared(system, chosen, implicit, watch, tolerance, judged=not prescribed)
     term = term_of(system, implicit)
@@ -218,17 +231,20 @@ def _parts(given: Given, options: Options, watch: Watch | None, begin: _Start) -
         )  # fmt: skip
     # With events, the solver is prepared for the discrete values of each mode, inside the steps
     # (`SystemProblem.prepared`). So it is wrapped as it was chosen.
-    problem = problem_for(system, t0, t1, implicit, watch, tolerance)
+    record = None if system.plan.delays is None else tolerances_of_a_record(controller, tolerance)
+    problem = problem_for(system, t0, t1, implicit, watch, tolerance, record)
     if system.plan.held is not None:
         admitted = admitted & jnp.all(jnp.isfinite(problem.admitted(t0, x0, system.discrete_values, inputs)))
         consistent = consistent & admitted
     resumed, q0 = begin.resumed, system.discrete_values
     q0 = q0 if resumed is None else without_clocked(system, q0)
     y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
+    y0 = problem.with_past(t0, y0, inputs, options.remembered)
+    saved = saved_with_events if system.plan.delays is None else SavedWithPast(problem)
     clashes = y0.stuck < -1
     return _Parts(
         term=HybridTerm(problem), solver=WithEvents(chosen, options.max_events, options.room, options.save_events),
-        controller=ending(controller, AtEvents()), dt0=dt0, problem=problem, y0=y0, saved=_with_events,
+        controller=ending(controller, AtEvents()), dt0=dt0, problem=problem, y0=y0, saved=saved,
         admitted=admitted, consistent=consistent, goes_on=admitted & (y0.ended == 0) & ~clashes, clashes=clashes,
     )  # fmt: skip
 
@@ -296,7 +312,3 @@ run_compiled = compiled(run)
 
 def _whole(t: Time, y: State, args: Args) -> State:
     return y
-
-
-def _with_events(t: Time, y: HybridState, args: Args) -> State:
-    return y.x, y.q, jax.lax.stop_gradient(jnp.concatenate([y.armed, y.ticks]))

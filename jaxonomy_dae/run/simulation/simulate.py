@@ -19,7 +19,9 @@ from ...host.cache import PROGRAMS
 from ...host.members import batch_size, is_batched, say_of_members
 from ...host.rows import filled_up
 from ...host.staging import as_argument, as_array, is_staged, is_traced, on_device, picked
+from ...solve.adjoint.resting import still
 from ...solve.adjoint.stored_adjoint import default_adjoint
+from ...solve.events.solver import FORGETS
 from ...solve.methods import BDF, Rodas5P, Tsit5
 from ...solve.methods.causes import decay_at, is_stiff
 from ...solve.methods.drive import is_implicit
@@ -47,7 +49,10 @@ from .step_sizes import clipped, controller_for, scaled_atol
 
 FEW_NUMBERS = 20_000  # on one side of all events: up to so many, states before and after events are kept (160 kB)
 ROOM = 100  # events that the log of a first run has room for; a run with more is made again with room for all
+# Steps within the longest delay for which there is room, and the most numbers that they take: each step copies these.
+REMEMBERED, MOST_REMEMBERED = 1024, 40_000
 MOST_EVENTS = 2**7 * ROOM  # of a run, if the user does not say: with a few steps each, near the default max_steps
+MOST_TICKS = 2**24  # counted in addition to `max_steps`: days of running
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
 
 
@@ -134,8 +139,9 @@ def simulate(
     - `control`: variables whose errors count in addition to those of the states, such as a pressure that depends on a
         mass by a large factor. When a solution is read, a warning names variables that amplify the tolerance of a
         state.
-    - `max_steps`: the largest number of steps, without those that end at samples. With `ts=None`, this many rows are
-        reserved.
+    - `max_steps`: the largest number of steps, without those that end at samples or at ticks of clocks. With `ts=None`,
+        this many rows are reserved. Ticks are counted where periods and the length of the run are known, not inside jit
+        where they are traced.
     - `max_events`: the largest number of events of conditions, which is also the room in `solution.events`. None:
         12,800 events. Outside jit, grad and vmap, the room starts at 100 events, and the run is repeated with twice the
         room until all fit. Inside, the first 100 are listed. Switches of relations in equations are not listed.
@@ -201,6 +207,7 @@ def simulate(
         )
     scaled = scaled_atol(system, atol)
     chosen, tolerances = (None, None) if prescribed else (comparable(solver), (rtol, scaled))
+    duration = None if is_traced((t0, t1)) else float(t1) - float(t0)
     asked = Asked(jump_ts, dtmax, max_steps, chosen, tuple(control), tolerances, throw is not False)
     call = _Call(
         system=system,
@@ -212,6 +219,7 @@ def simulate(
         atol=atol,
         scaled=scaled,
         ends=step_ends(system.plan, read),
+        ticks=_ticks(system, duration),
         adjoint=adjoint,
         controller=stepsize_controller,
         max_events=max_events,
@@ -219,7 +227,7 @@ def simulate(
         progress=progress,
         throw=throw,
         known=not is_traced((given, adjoint, stepsize_controller)),
-        duration=None if is_traced((t0, t1)) else float(t1) - float(t0),
+        duration=duration,
         asked=asked,
     )
     # A solver of the user's may hold what is traced, as the tolerance of its root finder.
@@ -259,6 +267,7 @@ class _Call:
     atol: Tolerance
     scaled: Tolerance  # atol of each entry of the state
     ends: StepEnds
+    ticks: int
     adjoint: diffrax.AbstractAdjoint | None
     controller: Controller
     max_events: int | None
@@ -268,11 +277,21 @@ class _Call:
     known: bool
     duration: float | None
     asked: Asked
+    more: int = 1  # times the room for what is delayed
 
     @property
     def bounds(self) -> tuple[int, int]:
         """The largest numbers of steps and of events."""
         return self.asked.max_steps, MOST_EVENTS if self.max_events is None else self.max_events
+
+    @property
+    def remembered(self) -> int:
+        """For so many steps within the longest delay there is room."""
+        delays = self.system.plan.delays
+        if delays is None:
+            return 0
+        room = min(REMEMBERED, max(MOST_REMEMBERED // (9 * len(delays)), 64))
+        return min(self.more * room, self.asked.max_steps) + 1
 
     @functools.cached_property
     def run_by(self) -> Solver:
@@ -301,8 +320,10 @@ class _Call:
             adjoint = default_adjoint(self.given, batch_size(self.given), self.known)
         return Options(
             solver=solver, adjoint=adjoint, controller=clipped(steps, asked.jump_ts, self.ends),
-            max_steps=asked.max_steps + self.ends.count, progress=self.progress, max_events=self.bounds[1], room=room,
+            max_steps=asked.max_steps + self.ends.count + self.ticks, progress=self.progress,
+            max_events=self.bounds[1], room=room,
             save_events=few and self.known if self.save_events is None else self.save_events,
+            remembered=self.remembered,
         )  # fmt: skip
 
     def watch(self, traced: bool) -> Watch | None:
@@ -374,6 +395,10 @@ class _Call:
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": t}
             outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
             counts = outcome.numbers() | before
+        while is_code(outcome.result, FORGETS) and call.remembered <= self.asked.max_steps:
+            call = dataclasses.replace(call, more=4 * call.more)
+            outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
+            counts = outcome.numbers()
         if outcome.events is not None and self.max_events is None and float(outcome.events.count) > room:
             room = _room_for(float(outcome.events.count))
             outcome = run_compiled(rows, call.options(room), None, begun=call.begun)
@@ -428,15 +453,32 @@ class _Call:
         return SimulationError(explain(solution, stopped, outcome.found.x, is_implicit(self.run_by), events))
 
 
+def _clocks(system: AcausalSystem) -> set[tuple[float, float]]:
+    """The different periods and offsets of clocks; none where they are not known."""
+    events = system.plan.events
+    if events is None or not events.n_clocks:
+        return set()
+    # Under `jax.grad` alone, too, their values are known, and nothing is compiled to look at them.
+    known = eqx.tree_at(lambda s: s.parameters, system, still(system.parameters))
+    if is_traced(known.parameters):
+        return set()
+    periods, offsets = SystemAt(system.plan, known.numbers, (), 0.0, {}, system.typical_sizes).clocks()
+    return set(zip(np.asarray(periods).tolist(), np.asarray(offsets).tolist(), strict=True))
+
+
+def _ticks(system: AcausalSystem, duration: float | None) -> int:
+    """The ticks of clocks in a run, each of which ends a step."""
+    ticks = 0.0 if duration is None else sum(duration / period for period, _ in _clocks(system) if period > 0)
+    return _room_for(min(ticks, MOST_TICKS)) if ticks else 0
+
+
 def _expected_events(system: AcausalSystem, duration: float) -> float:
     """The events that a model with clocks has, if each of its conditions comes true once in every shortest period: so
     the log of the first run has room for them, and no second program with a larger one is compiled."""
-    events = system.plan.events
-    if events is None or not events.n_clocks:
+    clocks, events = _clocks(system), system.plan.events
+    if not clocks or events is None:
         return 0.0
-    at = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes)
-    shortest = float(np.min(np.asarray(at.clocks()[0])))
-    return min(duration / shortest * len(events), MOST_EVENTS)
+    return min(duration / min(period for period, _ in clocks) * len(events), MOST_EVENTS)
 
 
 def _room_for(events: float) -> int:

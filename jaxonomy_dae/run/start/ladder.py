@@ -33,6 +33,7 @@ from jaxtyping import Bool, Float
 from ...base.tolerances import close, solved
 from ...solve.linear.arrays import Numbers, Verdict, loop, namespace, where
 from . import gauss_newton, homotopy
+from .following import followed
 from .probing import Probed, probed
 from .search import Base, Curve, Descent, Equations, Judged, Look, Probe, Rung, Search
 from .sizes import Sizes, column_sizes, row_sizes, terms_of, weighed
@@ -177,7 +178,8 @@ def _begun(equations: Equations, jacobian: Numbers, unit: Numbers, limit: Number
         rung=whole(where(stays, int(Rung.DONE), first)), fresh=xp.asarray(True), count=whole(0), climb=whole(1),
         probe=whole(Probe.START), method=whole(where(stays, 0, FAILED)), evaluations=whole(where(stays, 1, 0)),
         trial=origin, start=origin, best=origin, first=one_each, weight=one_each,
-        unit=where(stays, unit, xp.ones_like(unit)), flat=xp.zeros((n,), bool), base=base,
+        unit=where(stays, unit, xp.ones_like(unit)), flat=xp.zeros((n,), bool), open=equations.sizes.known == 0,
+        base=base,
         descent=Descent(number(1.0), number(1.0), number(1.0), number(0.0), along),
         curve=Curve(number(1.0), along, whole(0), number(1.0), number(1.0)),
     )  # fmt: skip
@@ -195,12 +197,13 @@ def _advanced(equations: Equations, search: Search) -> Search:
     linear = gauss_newton.linear_model(equations, search, base, judged, damping)
     down = gauss_newton.descended(equations, search, base, judged, linear, damping)
     curve = None if equations.core is None else homotopy.followed(equations, search, base.at, judged, linear)
-    return _next(equations, search, sized, judged, base, down, curve)
+    return _next(equations, search, at, sized, judged, base, down, curve)
 
 
 def _next(
     equations: Equations,
     search: Search,
+    at: Look,
     sized: Probed,
     judged: Judged,
     base: Base,
@@ -210,13 +213,15 @@ def _next(
     """What comes next: another step, another rung, another climb, or the end."""
     rung, count, begins, first = search.rung, search.count, search.begins, int(equations.first_rung)
     going, nearest = ~sized.goes_on, rung == Rung.NEAREST if equations.has_soft else np.False_
-    # A start that is not finite is no failure of a rung: points around it are tried, so that a logarithm of zero does
-    # not end the search.
+    # A start that is not finite is no failure of a rung: what follows from guesses is set, and points around it are
+    # tried, so that a logarithm of zero does not end the search.
     lost = going & begins & ~(judged.finite & (~nearest | down.determined))
-    steps_off = lost & (count < STEPS_OFF)
+    following, as_given = followed(equations, search, at), equations.xp.all(search.open == (equations.sizes.known == 0))
+    follows = lost & ~judged.finite & following.some & (search.climb == 1)
+    steps_off = lost & ~follows & (count < STEPS_OFF)
     fails = down.fails if curve is None else where(search.tracking, curve.fails, down.fails)
     stop = judged.reached & going
-    failed = going & ~stop & ~down.settled & ~steps_off & (fails | (search.fresh & ~judged.finite))
+    failed = going & ~stop & ~down.settled & ~steps_off & ~follows & (fails | (search.fresh & ~judged.finite))
     # A method that cannot lower |F| any more has arrived if all that is left is rounding.
     rounded = failed & base.holds & ~nearest & ~search.fresh
     stepped, foot, landed, follow = down.trial, base.at, np.False_, rung
@@ -236,23 +241,25 @@ def _next(
     restart = _restarted(equations, search, above, climbs_again, start, base.at)
     ahead = where(failed, restart, equations.bounded(stepped, base.at))
     ahead = where(sized.goes_on, sized.trial, where(steps_off, _off(equations, count), ahead))
+    ahead = where(follows, following.trial, ahead)
     probe = where(lost & (search.climb == 1), int(Probe.START), int(Probe.NONE))
     probe = where(climbs_again | (lost & (search.climb > 1)), int(Probe.SIZED), probe)
-    at = where(sized.goes_on, sized.start, foot)
+    here = where(sized.goes_on, sized.start, foot)
     turn = where(failed & (search.tracking | nearest), -1.0, search.curve.turn)  # to the other side of the curve
     return search._replace(
         rung=where(done, int(Rung.DONE), where(failed, where(climbs_again, first, above), follow)),
         fresh=sized.goes_on | failed | landed | lost,
-        count=where(failed | landed, 0, where(sized.goes_on, count, count + 1)),
+        count=where(failed | landed, 0, where(sized.goes_on | follows, count, count + 1)),
         climb=where(climbs_again, search.climb + 1, search.climb),
         probe=where(sized.goes_on, search.probe + 1, probe),
-        method=where(done, where(stop & begins, 0, rung), search.method),
+        method=where(done, where(stop & begins & as_given, 0, rung), search.method),
         evaluations=search.evaluations + 1,
         trial=ahead,
         start=start,
+        open=where(follows, following.open, search.open),
         # Where all rungs fail, the point where descent ended tells most about what does not hold.
         best=where((rung == Rung.MARQUARDT) & failed, base.at, search.best),
-        base=base._replace(at=at, jacobian=where(sized.goes_on, sized.slopes, base.jacobian)),
+        base=base._replace(at=here, jacobian=where(sized.goes_on, sized.slopes, base.jacobian)),
         descent=down.descent,
         curve=(search.curve if curve is None else curve.curve)._replace(turn=where(climbs_again, 1.0, turn)),
     )

@@ -106,7 +106,7 @@ class InitialProblem:
         if len(self.unknown):
             parameters = self._table.complete(parameters.at[self.unknown].set(w[self.plan.n_state :]))
         once = self.point.once
-        return SystemAt(self.plan, parameters, self.point.networks, self.t0, inputs, self.point.typical, once)
+        return SystemAt(self.plan, parameters, self.point.networks, self.t0, inputs, self.point.typical, once=once)
 
     def residual(self, w: Any, moving: tuple[Any, Any, Any]) -> Any:
         """F(w), shape (m,), with parameters, inputs and targets."""

@@ -174,7 +174,7 @@ class Search(NamedTuple):
     - `method`: the rung that succeeded; `evaluations`: of all.
     - `trial`: the point to look at next; `start`: where rungs begin; `best`: where descent ended.
     - `first`: F at the start; `weight`: of each row; `unit`: sizes of the unknowns; `flat`: those that nothing depends
-      on at the start.
+      on at the start; `open`: those without a guess that have not followed from other ones (`following.py`).
     """
 
     rung: Numbers
@@ -191,6 +191,7 @@ class Search(NamedTuple):
     weight: Numbers
     unit: Numbers
     flat: Numbers
+    open: Numbers
     base: Base
     descent: Descent
     curve: Curve

@@ -22,6 +22,7 @@ from ...compile.model.typical_sizes import typical_sizes
 from ...host.cache import compiled
 from ...host.platform import precisely
 from ...host.staging import is_staged, is_traced, joined, on_device, picked
+from ...solve.events.past import Remembered
 from ...solve.linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from .input_values import check_given
 from .inputs import check_range, read_inputs
@@ -51,6 +52,7 @@ class AcausalSystem(eqx.Module):
     stiffness: Stiffness | None = eqx.field(static=True)  # None where no solver is left to be chosen
     modes: Float[Array, "*batch relations"] | None = None  # hidden discrete variables, within a run
     once: TracedOnce | None = eqx.field(static=True, default=None)  # within a run
+    past: Remembered | None = None  # within a run
 
     # --- names -------------------------------------------------------------------------------------------------
 
@@ -226,7 +228,7 @@ class AcausalSystem(eqx.Module):
         args = read_inputs(self.plan, self.parameters.values.dtype, args)
         check_given(self.plan, args)
         networks = tuple(self.neural[n] for n in self.plan.network_names)
-        return SystemAt(self.plan, self.numbers, networks, t, args, self.typical_sizes, self.once)
+        return SystemAt(self.plan, self.numbers, networks, t, args, self.typical_sizes, self.past, self.once)
 
     @property
     def numbers(self) -> Float[Array, " m"]:
@@ -257,14 +259,16 @@ class AcausalSystem(eqx.Module):
             array = complete(events.dependents, array.at[chosen].set(values[:n]))
         # A start that is an expression holds at the start alone.
         parameters = Parameters(array, None, (), self.parameters.table.given(chosen))
-        return AcausalSystem(parameters, self.neural, self.typical_sizes, self.plan, None, values[n:], self.once)
+        return AcausalSystem(
+            parameters, self.neural, self.typical_sizes, self.plan, None, values[n:], self.once, self.past
+        )
 
     def around_event(self, t: Time, values: Any, previous: Any, args: Any = None) -> SystemAt:
         """`at`, with these values of the discrete variables and other values before the present event."""
         held = self.holding(values)
         point = held.at(t, args)
         numbers = point.parameters.at[-len(previous) :].set(previous) if len(previous) else point.parameters
-        return SystemAt(self.plan, numbers, point.networks, t, point.inputs, self.typical_sizes, self.once)
+        return SystemAt(self.plan, numbers, point.networks, t, point.inputs, self.typical_sizes, self.past, self.once)
 
     @property
     def discrete_values(self) -> Float[Array, " q"]:

@@ -19,16 +19,18 @@ from ...base.aliases import Args, Time
 from ...base.errors import ModelError
 from ...compile.lowering.gather import SCALARS, Chunk, Gather, entries, times
 from ...compile.lowering.plan import PlannedRow, SystemPlan
+from ...compile.lowering.plan_delays import DelayPlan
 from ...compile.lowering.plan_events import EventPlan, HeldPlan
 from ...compile.lowering.program import Program
 from ...compile.model.opaque import Networks
 from ...compile.model.starts import Start, formulas_of
 from ...host.staging import is_traced, joined, on_device
+from ...solve.events.past import Remembered
 from ...solve.linear.arrays import Numbers
 from ...solve.linear.once import stacked_in_batches
 from ...solve.linear.sparse import SparsePattern, sparse_jacobian
 from ...solve.linear.whole import solve_whole
-from ...solve.linear.written_out import UNROLLED, solve
+from ...solve.linear.written_out import UNROLLED_POSITIVE, solve
 from ...solve.methods.field_size import is_large
 from .evaluate import Evaluation
 from .input_values import input_values
@@ -43,14 +45,16 @@ class SystemAt:
 
     def __init__(
         self, plan: SystemPlan, parameters: Array, networks: tuple, t: Time, inputs: Args, typical: Array,
-        once: TracedOnce | None = None,
+        past: Remembered | None = None, once: TracedOnce | None = None,
     ):  # fmt: skip
-        """`typical` are the sizes of all quantities, shape (quantities,); `once`: see `traced_once`."""
+        """`typical` are the sizes of all quantities, shape (quantities,); `past` is that of a run, within it; `once`:
+        see `traced_once`."""
         self.plan, self.once = plan, once
         self.typical = jax.lax.stop_gradient(typical)
         self.parameters = parameters
         self.dtype = parameters.dtype
         self.networks = networks
+        self.past = past
         self.inputs = inputs
         self.t = on_device(t, self.dtype)
         self._last: tuple[Array, Chunk] | None = None  # the state that was asked for last, and its chunk
@@ -59,8 +63,19 @@ class SystemAt:
         """Evaluates a program at a state."""
         t = self.t if t is None else t
         inputs = input_values(self.plan, self.inputs, t, self.dtype)
-        networks = Networks(self.networks)
-        return Evaluation(self._chunk(x), inputs, self.parameters, t, networks, self.typical).run(program, refine)
+        networks, parameters = Networks(self.networks), self._with_past(x, inputs, t)
+        return Evaluation(self._chunk(x), inputs, parameters, t, networks, self.typical).run(program, refine)
+
+    def _with_past(self, x: Chunk, inputs: Chunk, t: Time) -> Array:
+        """The parameters, with what equations read of the past of a run."""
+        if self.past is None:
+            return self.parameters
+        delays, networks = self._delays(), Networks(self.networks)
+        at = Evaluation(self._chunk(x), inputs, self.parameters, t, networks, self.typical)
+        instant = jax.lax.stop_gradient(self._filled(at.run(delays.instants, Refinement.NONE), delays.instant))
+        waits = self.parameters[delays.parameters[:, 0]] > 0
+        read = jnp.stack([jnp.zeros_like(instant), instant, *self.past.read(t, instant, waits)], axis=1)
+        return self.parameters.at[delays.parameters].set(read)
 
     def _chunk(self, x: Chunk) -> Chunk:
         """The state as a tuple of scalars, if it is one or has up to `SCALARS` entries; else as an array."""
@@ -252,7 +267,13 @@ class SystemAt:
         inputs = input_values(self.plan, self.inputs, self.t, self.dtype)
         networks = Networks(self.networks)
         return Measured(
-            self._chunk(x), self._chunk(sizes), inputs, self.parameters, self.t, networks, self.typical
+            self._chunk(x),
+            self._chunk(sizes),
+            inputs,
+            self._with_past(x, inputs, self.t),
+            self.t,
+            networks,
+            self.typical,
         ).run(program, Refinement.NONE)
 
     @traced_once
@@ -331,7 +352,7 @@ class SystemAt:
     def _least_norm_step(self, x: Array) -> Array:
         plan = self.plan
         n = len(plan.states)
-        if plan.n_state <= SCALARS and plan.n_constraints <= UNROLLED and plan.held is None:
+        if plan.n_state <= SCALARS and plan.n_constraints <= UNROLLED_POSITIVE and plan.held is None:
             return self._least_norm_of_few(self._chunk(x))
         nominal = jnp.asarray(plan.nominal[:n], self.dtype)
         # Rows by reverse mode: there are fewer constraints than states.
@@ -348,7 +369,7 @@ class SystemAt:
         gram = jacobian @ jacobian.T
         gram = gram if absent is None else gram + jnp.diag(absent)
         # LAPACK apart, for few: with a matrix that turns out to be constant, XLA does not find it (jaxlib 0.10.2).
-        small = len(value) <= UNROLLED
+        small = len(value) <= UNROLLED_POSITIVE
         multiplier = (
             jnp.stack(solve([[*row] for row in gram], [*value], positive=True))
             if small
@@ -452,6 +473,29 @@ class SystemAt:
         if not n:
             return jnp.zeros((0,), self.dtype)
         return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), self.dtype), (n,))
+
+    # --- delays ------------------------------------------------------------------------------------------------
+
+    @traced_once
+    def delayed(self, x: Array) -> Array:
+        """What is delayed, and the times at which the past is read, shape (2, delays)."""
+        delays = self._delays()
+        sources = self._filled(self.run(delays.sources, x, Refinement.ROOT), delays.source)
+        return jnp.stack([sources, self._filled(self.run(delays.instants, x, Refinement.ROOT), delays.instant)])
+
+    def past_read(self, x: Array) -> Array:
+        """The discrete variables by which equations read the past, shape (delays, 5)."""
+        inputs = input_values(self.plan, self.inputs, self.t, self.dtype)
+        return self._with_past(x, inputs, self.t)[self._delays().parameters]
+
+    def longest_delays(self) -> Numbers:
+        """The longest delays, shape (delays,)."""
+        return self._computed(self._delays().table.longest)
+
+    def _delays(self) -> DelayPlan:
+        if self.plan.delays is None:
+            raise ModelError("nothing is delayed in this system")
+        return self.plan.delays
 
     # --- reading -----------------------------------------------------------------------------------------------
 

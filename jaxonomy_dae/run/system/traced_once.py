@@ -51,7 +51,7 @@ def traced_once(method: Callable[..., Array]) -> Callable[..., Array]:
     def call(self: Any, *given: Any) -> Array:
         if self.once is None:
             return method(self, *given)
-        own = self.parameters, self.networks, self.t, self.inputs, self.typical
+        own = self.parameters, self.networks, self.t, self.inputs, self.typical, self.past
         # Those that it calls are functions of their own, too.
         return self.once(method, functools.partial(type(self), self.plan, once=self.once), own, given)
 

@@ -70,8 +70,8 @@ class Resting(eqx.Module):
 
     @staticmethod
     def of(terms: Terms, solver: Solver, controller: Controller, y: State, args: Args, span: Time) -> "Resting | None":
-        """Prepares a second run. None where steps are prescribed or have no error estimate, and for a state that is not
-        one array (apart from what events keep beside it)."""
+        """Prepares a second run. None where steps are prescribed or have no error estimate, for a state that is not one
+        array (apart from what events keep beside it), and where equations read the past, of which there is one."""
         base = _innermost(controller)
         rtol, x = getattr(base, "rtol", None), _moving(y)
         is_array = isinstance(x, jax.Array) and x.ndim == 1 and x.size > 0
@@ -79,7 +79,7 @@ class Resting(eqx.Module):
         prescribed = isinstance(base, diffrax.StepTo | diffrax.ConstantStepSize)
         # Steps that the user prescribes are not to be changed, and without an error estimate a second run would limit
         # nothing.
-        if prescribed or not is_array or not is_adaptive:
+        if prescribed or not is_array or not is_adaptive or getattr(y, "past", None) is not None:
             return None
         return Resting(terms, _small(solver, base), base, args, span)
 

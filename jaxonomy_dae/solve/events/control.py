@@ -24,7 +24,7 @@ class AtEvents(End):
     def inside(self, terms, y):
         # The controller by errors sees the continuous state alone. Counts and times of the bookkeeping have no error,
         # and would dilute a norm.
-        return None if terms is None else bound(terms, y.q), y.x
+        return None if terms is None else bound(terms, y), y.x
 
     def first(self, t, end, y, args, span):
         return jnp.minimum(end, _due(y)), jnp.full_like(jnp.asarray(t), jnp.inf)
@@ -52,4 +52,5 @@ class AtEvents(End):
 
 
 def _due(y: HybridState) -> Array:
-    return lax.stop_gradient(jnp.min(y.due, initial=jnp.inf))
+    ends = y.due if y.past is None else jnp.append(y.due, y.past.until)
+    return lax.stop_gradient(jnp.min(ends, initial=jnp.inf))

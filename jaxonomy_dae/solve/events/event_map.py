@@ -53,17 +53,18 @@ def _most_in_turn(problem: AbstractHybridProblem) -> int:
 def handle(
     problem: AbstractHybridProblem, t: Time, state: HybridState, arrival: Arrival, args: Args, noted: EventRows,
     at_start: bool = False,
-) -> tuple[HybridState, Array, EventRows]:  # fmt: skip
-    """Returns (the state after all events of an instant, dx/dt there, `noted` with the events that are listed).
+) -> tuple[HybridState, Array, EventRows, Time]:  # fmt: skip
+    """Returns (the state after all events of an instant, dx/dt there, `noted` with the events that are listed, the time
+    of the last of them, which moves with parameters).
 
     At the initial time, `at_start`, events do not move with parameters, and are logged only if they end the run.
     """
-    args, may_jump = problem.at_instant(args)
+    earlier, (problem, args, may_jump) = (problem, args), problem.at_instant(args)
     first = arrival.due
     # At the initial time there is no before against which something could have jumped.
     if may_jump and problem.facts.n_guards and not at_start:
         arrival, first = _with_jumps(problem, t, state, arrival, args)
-    events = _Events.of(problem, t, state, arrival, args, at_start)
+    events = _Events.of(problem, t, state, arrival, args, at_start, earlier)
     start = Instant(
         state=state, left=arrival.due, caused=arrival.jumped, delay=jnp.zeros_like(t), time=t, round=first,
         before=state.x, approach=arrival.slope, previous=state.q, there=state.x, slope=arrival.slope, arrived=state.x,
@@ -78,7 +79,7 @@ def handle(
     if length > inner:
         handled = _while_any_is_left(handled, -(-length // inner))
     instant = handled(start)
-    return instant.state, instant.slope, instant.noted
+    return instant.state, instant.slope, instant.noted, instant.time
 
 
 def _with_jumps(
@@ -102,8 +103,8 @@ def _with_jumps(
 
 class _Events(NamedTuple):
     """What the events of one instant share: the time, at which the step ends; what is due; `first`, the events that
-    were listed before; `turns`, those that there were while time did not go on; and what events are, by their
-    numbers."""
+    were listed before; `turns`, those that there were while time did not go on; what events are, by their numbers; and
+    the problem and inputs as they were `earlier`, just before."""
 
     problem: AbstractHybridProblem
     t: Time
@@ -119,11 +120,13 @@ class _Events(NamedTuple):
     strikes: Array
     last: np.ndarray
     waits: Array | np.ndarray
+    earlier: tuple[AbstractHybridProblem, Args]
 
     @staticmethod
     def of(
-        problem: AbstractHybridProblem, t: Time, state: HybridState, arrival: Arrival, args: Args, at_start: bool
-    ) -> "_Events":
+        problem: AbstractHybridProblem, t: Time, state: HybridState, arrival: Arrival, args: Args, at_start: bool,
+        earlier: tuple[AbstractHybridProblem, Args],
+    ) -> "_Events":  # fmt: skip
         """The events of the instant t at which a step arrives."""
         facts = problem.facts
         c, g = facts.n_clocks, facts.n_guards
@@ -135,6 +138,7 @@ class _Events(NamedTuple):
             listed=facts.are(EventFlag.LISTED) & (np.arange(c + g) >= c) & (not at_start),
             ends=jnp.asarray(facts.ends).astype(t.dtype), relations=jnp.asarray(facts.are(EventFlag.RELATION)),
             strikes=jnp.asarray(facts.are(EventFlag.STRIKE)), last=facts.are(EventFlag.LAST), waits=waits,
+            earlier=earlier,
         )  # fmt: skip
 
     @property
@@ -197,7 +201,11 @@ class _Events(NamedTuple):
         # followed back over it: they keep the value after the event.
         back = delay - (1.0 - after.slow) * lax.stop_gradient(delay)
         logged = now.these & (self.listed | (self.ends > 0))
-        sides = jnp.concatenate([reached, q]), jnp.concatenate([x, after.q])
+        there, here = q, after.q
+        if state.past is not None:
+            before, given = self.earlier
+            there, here = before.with_past_read(t, reached, q, given), problem.with_past_read(t, x, here, args)
+        sides = jnp.concatenate([reached, there]), jnp.concatenate([x, here])
         return Instant(
             state=state.but(
                 x=x - after.slope * back,

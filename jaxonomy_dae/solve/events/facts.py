@@ -9,6 +9,22 @@ from ...write.events import EventFlag
 
 
 @dataclasses.dataclass(frozen=True)
+class DelayFacts:
+    """What is known of delayed quantities before a run.
+
+    - `clocks`: the number of the event of each, which happens where a break of the past comes out of the delay.
+    - `begins`: the place of the discrete value that this event sets to zero: 1 while a break waits for it.
+    - `constant`: whether each delay is constant.
+    - `passes`: for each source, which delayed quantities it follows algebraically, so that a jump of them is one of it.
+    """
+
+    clocks: tuple[int, ...]
+    begins: tuple[int, ...]
+    constant: tuple[bool, ...]
+    passes: tuple[tuple[bool, ...], ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class EventFacts:
     """What is known of events before a run: sampled events come first, `n_clocks` of them, then those of conditions.
 
@@ -19,6 +35,7 @@ class EventFacts:
     - `only_kinks`: whether all events are relations at which neither dx/dt nor guards jump.
     - `contested`: (event, place) for each place that several events may write with different values; places are those
       of (x, q) in one array, those of q counted from its end, −1 the last.
+    - `delays`: of the delayed quantities; None if there are none.
     """
 
     flags: tuple[EventFlag, ...]
@@ -29,6 +46,7 @@ class EventFacts:
     choice_guards: tuple[int, ...] = ()
     only_kinks: bool = False
     contested: tuple[tuple[int, int], ...] = ()
+    delays: DelayFacts | None = None
 
     @property
     def n_guards(self) -> int:

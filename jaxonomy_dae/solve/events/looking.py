@@ -29,6 +29,7 @@ BEND = 0.1
 # What counts as "at the same time" is measured by how long steps have been of late, because steps next to events are
 # short. Each step leaves this part of that length.
 FORGOTTEN = 0.8
+BESIDE = 2.0**-20  # of a state: far beyond rounding, also in single precision
 
 
 def _off_parabola() -> np.ndarray:
@@ -118,9 +119,16 @@ def looked_at(
     # The last place is the end itself: t0 + h may be rounded off it, and off a tick or a saved time.
     times = jnp.append(t0 + h * jnp.asarray(LOOKS[:-1], t1.dtype), t1)
     states = jnp.concatenate([jax.vmap(lambda t: dense(t0, t1, t))(times[:-1]), x1[None]])
-    values = jax.vmap(lambda t, x: problem.guards(t, x, q, args))(times, states)
+    # A guard that is small beside its terms, as the speed of what is locked, is as exact as these are. Looked at beside
+    # the end, with each state off by a part of its own, it tells their sizes.
+    beside = x1 * (1 + BESIDE * jnp.asarray(_apart(len(x1)), x1.dtype))
+    *values, there = jax.vmap(lambda t, x: problem.guards(t, x, q, args))(
+        jnp.append(times, t1), jnp.concatenate([states, beside[None]])
+    )
+    values = jnp.stack(values)
     size = jnp.abs(values)
-    largest = jnp.maximum(jnp.max(size, axis=0), y0.size)
+    terms = jnp.abs(there - values[-1]) / BESIDE
+    largest = jnp.maximum(jnp.maximum(jnp.max(size, axis=0), y0.size), terms)
     off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
     # Most steps meet nothing: all guards are farther from zero than they were seen to move.
     moves = jnp.max(values, axis=0) - jnp.min(values, axis=0)

@@ -69,10 +69,35 @@ class AbstractHybridProblem(eqx.Module):
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
         """Periods and offsets of the sampled events; the period is infinite for one that happens once."""
 
-    def at_instant(self, args: Args) -> tuple[Args, bool]:
-        """Returns (what the equations read at an instant and from then on, whether that may differ from what they read
-        just before)."""
-        return args, False
+    def at_instant(self, args: Args) -> "tuple[AbstractHybridProblem, Args, bool]":
+        """Returns (the problem and what its equations read at an instant and from then on, whether that may differ from
+        what they read just before)."""
+        return self, args, False
+
+    # Of what is delayed, where `facts.delays` are there:
+
+    def remembering(self, past: Any, ticks: Float[Array, " delays"] | None = None) -> "AbstractHybridProblem":
+        """The problem whose equations read this past (`past.Remembered`); `ticks`: when the breaks come out of the
+        delays that do so now."""
+        raise NotImplementedError
+
+    def sources(
+        self, t: Time, x: State, q: Array, args: Args
+    ) -> tuple[Float[Array, " delays"], Float[Array, " delays"]]:
+        """Returns (what is delayed, the times at which the past is read)."""
+        raise NotImplementedError
+
+    def longest(self) -> Float[Array, " delays"]:
+        """The longest delays."""
+        raise NotImplementedError
+
+    def allowed(self, size: Float[Array, " delays"]) -> Float[Array, " delays"]:
+        """The error that is allowed in a record of what is delayed, given how large that is."""
+        raise NotImplementedError
+
+    def with_past_read(self, t: Time, x: State, q: Array, args: Args) -> Float[Array, " q"]:
+        """The discrete values with what equations read of the past, so that it is not needed any more."""
+        return q
 
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
         """The time of the next tick of each clock, given the number of ticks so far."""
@@ -110,6 +135,7 @@ class HybridState(AbstractAppending):
         fallen without time going on.
     - `count`: how many events there were; `table`: the first ones, or None where `StoredAdjoint` keeps them elsewhere.
     - `iteration`: how far repeated events are at this instant; None without such.
+    - `past`: the record of what is delayed (`past.Past`); None without such.
     """
 
     x: Float[Array, " n"]
@@ -119,6 +145,7 @@ class HybridState(AbstractAppending):
     of_run: Float[Array, "6"]
     table: EventRows | None
     iteration: Iteration | None = None
+    past: Any = None
 
     @classmethod
     def of(
@@ -130,7 +157,7 @@ class HybridState(AbstractAppending):
 
     def but(self, **changes: Any) -> "HybridState":
         """A copy with the named parts replaced."""
-        whole = {name: changes.pop(name) for name in ("x", "q", "iteration") if name in changes}
+        whole = {name: changes.pop(name) for name in ("x", "q", "iteration", "past") if name in changes}
         for field, names in _PARTS.items():
             if not changes.keys().isdisjoint(names):
                 parts = zip(names, getattr(self, field), strict=True)
@@ -183,6 +210,12 @@ def problem_of(terms: Terms) -> AbstractHybridProblem:
     return unwrapped(terms)[0].problem
 
 
-def bound(terms: Terms, q: Any) -> Any:
-    """The terms of the equations that hold with the discrete values q."""
-    return rewrapped(terms, problem_of(terms).term(q))
+def problem_after(terms: Terms, y: HybridState) -> AbstractHybridProblem:
+    """The problem inside the terms, with the past of a state."""
+    problem = problem_of(terms)
+    return problem if y.past is None else problem.remembering(y.past.onwards(problem.resolution))
+
+
+def bound(terms: Terms, y: HybridState) -> Any:
+    """The terms of the equations that hold with the discrete values and the past of a state."""
+    return rewrapped(terms, problem_after(terms, y).term(y.q))

@@ -79,7 +79,7 @@ def start(
     # Guards of conditions that hold at the start need not be near zero.
     slope = jnp.zeros_like(x0) if resumed is None else problem.slope(t0, x0, q0, args)
     arrival = Arrival(slope, rate, due, due_conditions, size, tolerance, tolerance)
-    state, _, table = handle(problem, t0, state, arrival, args, table, at_start=resumed is None)
+    state, _, table, _ = handle(problem, t0, state, arrival, args, table, at_start=resumed is None)
     return dataclasses.replace(state, table=table)
 
 

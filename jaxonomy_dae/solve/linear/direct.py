@@ -18,7 +18,7 @@ from ...base.errors import ModelError
 from .algebra import Dense as DenseAlgebra
 from .operator import SparseLinearOperator
 from .sparse import SparsePattern, factorised_solve
-from .written_out import UNROLLED
+from .written_out import UNROLLED_POSITIVE as MOST
 from .written_out import solve as solve_written_out
 
 
@@ -83,8 +83,8 @@ class WrittenOut(_AbstractDirect):
 
     def _kept(self, operator):
         n = operator.in_size()
-        if n > UNROLLED:
-            raise ModelError(f"WrittenOut is for up to {UNROLLED} unknowns; this operator has {n}: use Dense()")
+        if n > MOST:
+            raise ModelError(f"WrittenOut is for up to {MOST} unknowns; this operator has {n}: use Dense()")
         return operator.as_matrix(), None
 
     def _solved(self, state, b):
